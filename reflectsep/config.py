@@ -1,0 +1,241 @@
+"""Settings of every job: plain dataclasses that check themselves, made in Python or by the command alike.
+
+Each field is made by `setting`, which holds its help text and its bounds; a `Literal` type lists its choices. From
+these come the structured configs that Hydra checks overrides against (`reflectsep.cli.overrides`) and the help of the
+command. Settings are not frozen. A job is what the function `run_*` of `reflectsep.pipeline` of its name takes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from reflectsep.errors import SettingsError
+from reflectsep.settings import check, required, setting, shown
+
+HOME_RIG = "six"
+"""The rig that default folder names do not mention."""
+
+
+@dataclass(kw_only=True)
+class ObjectSettings:
+    """What is pictured; all but the name matters to the simulator alone."""
+
+    key: ClassVar[str] = "object."
+    name: str = setting("", "names the default folders captures/NAME and results/NAME")
+    preset: Literal["wax", "pudding", "plastic"] = setting("wax", "simulated object")
+    size_px: int = setting(96, "width and height of the simulated pictures", at_least=16, at_most=4096)
+    channels: Literal[1, 3] = setting(1, "1 for grey, 3 for colour")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class RigSettings:
+    """Simulated lights, slab and camera; a fit reads all of this from the capture."""
+
+    key: ClassVar[str] = "rig."
+    name: str = setting(HOME_RIG, f"added to the default folder names unless it is {HOME_RIG}")
+    lights: int = setting(6, "full pictures, the three basis lights included", at_least=3, at_most=500)
+    basis_angle_deg: float = setting(25.0, "angle of the basis lights off the view", above=0.0, at_most=85.0)
+    spread_deg: float = setting(30.0, "largest angle of the other lights off the view", above=0.0, at_most=85.0)
+    heldout: int = setting(3, "more lights, kept out of the capture to relight", at_least=0, at_most=100)
+    sweeps: int = setting(3, "lights that are swept with a slab, the basis first; 0: none", at_least=0)
+    orthogonal: bool = setting(True, "sweep each of them along y as well as along x")
+    slab_width_px: float = setting(4.0, "width of the slab", above=0.0)
+    slab_step_px: float = setting(2.0, "its step from frame to frame", above=0.0)
+    full_exposure_s: float = setting(0.01, "exposure of the full pictures", above=0.0)
+    sweep_exposure_s: float = setting(0.01, "exposure of the slab frames", above=0.0)
+    dark_level: float = setting(0.0, "what a covered lens reads, of full scale", at_least=0.0, at_most=0.9)
+    read_noise: float = setting(0.0, "standard deviation at black, of full scale", at_least=0.0, at_most=0.5)
+    shot_noise: float = setting(0.0, "standard deviation at full scale, of full scale", at_least=0.0, at_most=0.5)
+    bits: int | None = setting(None, "quantisation; null: none", at_least=4, at_most=16)
+    headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class FitSettings:
+    """How Eqs. 20 and 21 are fitted."""
+
+    key: ClassVar[str] = "fit."
+    method: Literal["joint", "two_step"] = setting("joint", "all parameters at once, or globals on chosen pixels first")
+    scattering: Literal["measured", "none", "unknown"] = setting(
+        "measured", "from the sweeps, left out (Lin & Lee), or fitted (7 unknowns a pixel)"
+    )
+    n_s: float | None = setting(None, "exponent of the lobe; null: fitted", above=0.0, at_most=1000.0)
+    refine_n_d: bool = setting(False, "fit n_d as a fifth global")
+    weights: Literal["paper", "noise"] = setting("paper", "of Eq. 22: the two lambdas, or each picture's noise")
+    lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
+    lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)
+    robust: Literal["huber", "cauchy", "none"] = setting("huber", "loss that weighs cast shadows down")
+    max_iterations: int = setting(60, "limit of the joint iterations", at_least=1)
+    tolerance: float = setting(
+        1e-6, "relative change of the cost that ends a pixel's iterations", above=0.0, at_most=1.0
+    )
+    globals_pixels: int = setting(400, "pixels that start the globals", at_least=8)
+    chunk: int = setting(65536, "pixels handled at once; bounds the memory", at_least=1)
+    prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
+    dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
+    seed: int = setting(0, "of the choice of pixels", at_least=0)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class ScatterSettings:
+    """How the scattering comes out of the sweeps (Eqs. 23 to 25)."""
+
+    key: ClassVar[str] = "scatter."
+    hole_filling: Literal["profile", "time", "maximum", "interpolation", "orthogonal"] = setting(
+        "profile", "what stands in where the slab itself lit"
+    )
+    lit_band: Literal["threshold", "profile"] = setting("threshold", "how the lit band of a frame is found")
+    threshold: float = setting(0.25, "frame over full picture, above which a pixel is lit", above=0.0, at_most=1.0)
+    n_d: float | None = setting(None, "exponent of the diffuse part; null: estimated", above=0.0, at_most=10.0)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class SimulateJob:
+    """Write a simulated capture with its truth beside it."""
+
+    key: ClassVar[str] = ""
+    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="wax"))
+    rig: RigSettings = field(default_factory=RigSettings)
+    mode: Literal["transport", "paper"] = setting("transport", "light transport, or data exactly by the paper's model")
+    seed: int = setting(0, "of the noise", at_least=0)
+    out: str = setting("", "capture folder to write; default captures/NAME", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or f"captures/{folder_name(self.object, self.rig)}"
+
+
+@dataclass(kw_only=True)
+class FitJob:
+    """Separate a capture: write a result folder."""
+
+    key: ClassVar[str] = ""
+    object: ObjectSettings = field(default_factory=ObjectSettings)
+    rig: RigSettings = field(default_factory=RigSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    scatter: ScatterSettings = field(default_factory=ScatterSettings)
+    capture: str = setting("", "capture folder, or pictures with a light list; default captures/NAME", path=True)
+    out: str = setting("", "result folder to write; default results/NAME", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+    basis: list[str] | None = setting(None, "names of three basis lights; null: the capture's", length=3)
+    heldout: list[str] | None = setting(None, "names of lights to leave out of the fit")
+    lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not self.capture and not self.object.name:
+            raise SettingsError("no capture: give capture=FOLDER, or object=NAME for captures/NAME")
+        if self.basis is not None and len(set(self.basis)) != len(self.basis):
+            raise SettingsError(f"basis={shown(self.basis)}: the three lights must differ")
+        name = folder_name(self.object, self.rig) if self.object.name else Path(self.capture).resolve().name
+        self.capture = self.capture or f"captures/{name}"
+        self.out = self.out or f"results/{name}"
+
+
+@dataclass(kw_only=True)
+class RelightJob:
+    """Write pictures of a result under other lights."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to relight", path=True)
+    lights: str | None = setting(None, "file of lights, .lp or .json", path=True)
+    direction: list[float] | None = setting(None, "one light, from the object to the light", length=3)
+    alpha: list[float] | None = setting(None, "one light as a mix of the basis lights", length=3)
+    orbit: int | None = setting(None, "number of lights on a circle around the view", at_least=1, at_most=9999)
+    elevation_deg: float = setting(45.0, "of the orbit above the picture plane", at_least=0.0, at_most=90.0)
+    intensity: float = setting(1.0, "times that of every light", at_least=0.0)
+    out: str = setting("relit", "folder to write NAME.exr into", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        ways = ("lights", "direction", "alpha", "orbit")
+        given = [name for name in ways if getattr(self, name) is not None]
+        if len(given) != 1:
+            what = f"both {' and '.join(given)} are given" if given else "no light is given"
+            raise SettingsError(f"{what}: give one of lights=FILE, direction=[x,y,z], alpha=[a1,a2,a3], orbit=N")
+        if self.direction is not None and not math.hypot(*self.direction) > 1e-6:
+            raise SettingsError(f"direction={shown(self.direction)}: must not be zero")
+
+
+@dataclass(kw_only=True)
+class CompareJob:
+    """Draw a result beside Lin & Lee's and, for held-out lights, beside the real pictures."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to compare", path=True)
+    out: str = setting("compare.png", "figure to write (.png)", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        if Path(self.out).suffix.lower() != ".png":
+            raise SettingsError(f"out={self.out}: must end in .png")
+
+
+@dataclass(kw_only=True)
+class InfoJob:
+    """Say what is in a capture or a result."""
+
+    key: ClassVar[str] = ""
+    path: str = required("capture or result folder", path=True)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class DemoJob:
+    """Simulate, fit, relight and compare a small object, to see the whole thing."""
+
+    key: ClassVar[str] = ""
+    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="wax"))
+    rig: RigSettings = field(default_factory=RigSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    scatter: ScatterSettings = field(default_factory=ScatterSettings)
+    out: str = setting("demo", "folder to write", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | DemoJob
+
+JOBS: dict[str, type[Job]] = {
+    "simulate": SimulateJob,
+    "fit": FitJob,
+    "relight": RelightJob,
+    "compare": CompareJob,
+    "info": InfoJob,
+    "demo": DemoJob,
+}
+
+
+def folder_name(item: ObjectSettings, rig: RigSettings) -> str:
+    """Last part of the default folders: the object's name, and the rig's where it is not the usual one.
+
+    Raises:
+        SettingsError: the object has no name, or one that is no plain folder name.
+    """
+    if not item.name:
+        raise SettingsError("the object has no name: give object=NAME, object.name=NAME or the folder itself")
+    if Path(item.name).name != item.name:
+        raise SettingsError(f"object.name={item.name}: must be a plain name, not a path")
+    return item.name if rig.name == HOME_RIG else f"{item.name}-{rig.name}"

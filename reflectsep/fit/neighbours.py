@@ -1,0 +1,56 @@
+"""What the pixels around a pixel say: smooth maps with their scatter, and lobes handed on from neighbour to neighbour.
+
+About one pixel in a hundred has two minima of nearly equal cost, one wrong. Smoothing would blur the ninety-nine;
+instead a pixel is offered its neighbours' lobe as a start, and keeps whichever of its minima costs least.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
+from torch.nn.functional import pad, unfold
+
+MAD_TO_SD = 1.4826
+
+
+def to_map(values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"]) -> Tensor:
+    """Values of the mask's pixels as pictures (channels, height, width), zero elsewhere."""
+    picture = values.new_zeros(values.shape[1], *mask.shape)
+    picture[:, mask] = values.T
+    return picture
+
+
+def smooth(
+    values: Float[Tensor, "pixels channels"],
+    weight: Float[Tensor, "pixels"],
+    mask: Bool[Tensor, "height width"],
+    sigma_px: float,
+) -> Float[Tensor, "pixels channels"]:
+    """Gaussian mean over the pixels of the mask, each counted by its weight (normalised convolution)."""
+    reach = 2 * max(1, round(3 * sigma_px)) + 1
+    blur = lambda p: gaussian_blur2d(p[None], (reach, reach), (sigma_px, sigma_px), "constant")[0]  # noqa: E731
+    total = blur(to_map(values * weight[:, None], mask))
+    count = blur(to_map(weight[:, None], mask))
+    return (total / count.clamp_min(1e-12))[:, mask].T
+
+
+def neighbourhood(
+    values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"], radius: int
+) -> Float[Tensor, "pixels channels window"]:
+    """Values of the window about every pixel, the pixel itself left out; NaN where the mask ends."""
+    picture = to_map(values, mask)
+    picture = torch.where(mask, picture, torch.nan)
+    side = 2 * radius + 1
+    window = unfold(pad(picture[:, None], (radius,) * 4, value=torch.nan), side)
+    window = torch.cat([window[:, : side * side // 2], window[:, side * side // 2 + 1 :]], 1)
+    return window[:, :, mask.flatten()].permute(2, 0, 1)
+
+
+def local_median(
+    values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"], radius: int
+) -> Float[Tensor, "pixels channels"]:
+    """Median of the neighbours, channel by channel; a pixel without neighbours keeps its own value."""
+    median = neighbourhood(values, mask, radius).nanmedian(-1).values
+    return torch.where(median.isfinite(), median, values)

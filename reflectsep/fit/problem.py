@@ -1,0 +1,247 @@
+"""Eqs. 20 to 22 as a least-squares problem of blocks: one block a pixel.
+
+    local   l = (d_11, d_12, d_13, d_21, ...; log B [; s_11, ...])       channel-major; 3 C + 1 [+ 3 C] numbers
+    shared  g = (a_1, a_2, a_3, log n_s, log C_2, softness, sqrt haze, log n_d)
+
+Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel and light, then the priors' rows:
+
+    shape     (log B + log(|M d|^2 / M d . V) - log C_2) / tau       B d is C_2 (N.V) N.L_k, so B follows from d
+    parallel  (d + s) off the direction of s, relative to |s|         whole and scattered light see one irradiance
+    ratio     (d + s) / s against its neighbourhood                   how much scatters changes slowly over a surface
+    measured  (s - measured s) / its standard deviation               where s is unknown too
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.model import Globals, edge_width, reflectance
+from reflectsep.solve.problem import BlockProblem
+
+SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haze", "log_n_d")
+LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """What is known of every pixel, flattened, for lights of unit intensity."""
+
+    images: Float[Tensor, "pixels channels lights"]
+    s: Float[Tensor, "pixels channels lights"]
+    weight: Float[Tensor, "pixels channels lights"]
+    """sqrt(lambda_j) / sigma; 0 removes a value."""
+    clipped: Bool[Tensor, "pixels channels lights"]
+    """Known only to be at least `images`."""
+    alpha: Float[Tensor, "lights 3"]
+    normal_map: Float[Tensor, "3 3"]
+    """M, with M d along the surface normal: the inverse of the basis light directions."""
+    view: Float[Tensor, "3"]
+    cosine: Float[Tensor, "3"]
+    """L_k . V of the basis lights; ones where unknown."""
+    lights_known: bool
+    n_d: float | None
+    """The diffuse exponent; None where it is fitted."""
+    s_unknown: bool = False
+    """The scattering roots of the basis lights are local unknowns too."""
+
+    def __len__(self) -> int:
+        """Number of pixels."""
+        return len(self.images)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return self.images.shape[1]
+
+    @property
+    def s_basis(self) -> Float[Tensor, "pixels channels 3"]:
+        """Scattering roots of the basis lights."""
+        return self.s[..., :3]
+
+    def take(self, index: Tensor) -> Observations:
+        """Some of the pixels."""
+        return replace(
+            self,
+            images=self.images[index],
+            s=self.s[index],
+            weight=self.weight[index],
+            clipped=self.clipped[index],
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Priors:
+    """What is expected of a pixel before its pictures are looked at; a weight of 0 switches a row off."""
+
+    shape: float = 1.0 / 0.1
+    """1 / tau of the shape row."""
+    parallel: Float[Tensor, "pixels"]
+    ratio: Float[Tensor, "pixels"]
+    ratio_weight: Float[Tensor, "pixels"]
+    s_weight: Float[Tensor, "pixels"]
+    """1 / standard deviation of the measured s; only where s is a local unknown."""
+    mirror_sd: float = 0.05
+    """Standard deviation of log(C_2 / -2 C_1): 0 for a lobe about the mirror direction."""
+    common_sd: float = 0.03
+    """Relative standard deviation of a_k / (L_k . V) among the basis lights."""
+    height: float = 1.0
+    """Largest specular value seen: the lobe's peak beyond it is penalised."""
+    height_sd: float = 0.5
+    """Standard deviation of the logarithm of that excess."""
+    softness_sd: float = 0.3
+    haze_sd: float = 0.3
+    """Standard deviation of sqrt(haze)."""
+
+    def take(self, index: Tensor) -> Priors:
+        """Some of the pixels."""
+        return replace(
+            self,
+            parallel=self.parallel[index],
+            ratio=self.ratio[index],
+            ratio_weight=self.ratio_weight[index],
+            s_weight=self.s_weight[index],
+        )
+
+
+def no_priors(pixels: int, like: Tensor) -> Priors:
+    """Priors whose rows of single pixels are all switched off."""
+    zero = like.new_zeros(pixels)
+    return Priors(shape=0.0, parallel=zero, ratio=zero, ratio_weight=zero, s_weight=zero)
+
+
+@dataclass(frozen=True)
+class Locals:
+    """A pixel's unknowns by name."""
+
+    d: Float[Tensor, "pixels channels 3"]
+    log_B: Float[Tensor, "pixels"]
+    s: Float[Tensor, "pixels channels 3"] | None
+
+    @property
+    def B(self) -> Float[Tensor, "pixels"]:  # noqa: N802  (the paper's symbol)
+        """The lobe's factor."""
+        return self.log_B.exp()
+
+    def pack(self) -> Float[Tensor, "pixels P"]:
+        """As one row a pixel."""
+        parts = [self.d.flatten(-2), self.log_B[..., None]]
+        return torch.cat(parts if self.s is None else [*parts, self.s.flatten(-2)], -1)
+
+
+def unpack(local: Tensor, channels: int) -> Locals:
+    """One row a pixel, by name."""
+    P = 3 * channels
+    d = local[..., :P].unflatten(-1, (channels, 3))
+    s = local[..., P + 1 :].unflatten(-1, (channels, 3)) if local.shape[-1] > P + 1 else None
+    return Locals(d, local[..., P], s)
+
+
+def unpack_globals(shared: Float[Tensor, "8"], n_d: float | None) -> Globals:
+    """The shared unknowns by name, in the model's own parameters; `n_d` where it is not fitted."""
+    return Globals(
+        a=shared[:3],
+        n_s=shared[LOG_N_S].exp(),
+        n_d=shared[LOG_N_D].exp() if n_d is None else n_d,
+        softness=shared[SOFTNESS],
+        haze=shared[ROOT_HAZE].square(),
+    )
+
+
+def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: bool) -> Float[Tensor, "*pixels"]:
+    """log of |M d|^2 / (M d . V), or of mean_k d where the lights are unknown: C_2 / B by the lobe's geometry.
+
+    d_k = q N.L_k gives M d = q N; and B d_k = C_2 (N.V)(N.L_k) (Eqs. 6, 7 and 18), hence B = C_2 (N.V) / q.
+    """
+    if not known:
+        mean = d.mean(-1)
+        return (0.5 * (mean + (mean.square() + 1e-8).sqrt())).log()
+    g = d @ M.mT
+    facing = g @ view
+    # Smooth stand-ins for max(., 0): a normal turned away must not make the row infinite.
+    facing = 0.5 * (facing + (facing.square() + 1e-6).sqrt())
+    return (g.square().sum(-1) + 1e-6).log() - facing.log()
+
+
+def pixel_residual(
+    local: Tensor, shared: Tensor, obs: Observations, priors: Priors
+) -> Float[Tensor, "pixels residuals"]:
+    """Residuals of every pixel, pictures first, then the priors' rows."""
+    x = unpack(local, obs.channels)
+    s = obs.s_basis if x.s is None else x.s
+    s_all = obs.s if x.s is None else x.s @ obs.alpha.mT
+    model = reflectance(
+        x.d, x.B, unpack_globals(shared, obs.n_d), s=s_all, alpha=obs.alpha, width=edge_width(obs.s_basis, shared[SOFTNESS])
+    )
+    misfit = model - obs.images
+    # A clipped value is only a lower bound: a brighter model costs nothing.
+    misfit = torch.where(obs.clipped, misfit.clamp_max(0.0), misfit)
+    rows = [(misfit * obs.weight).flatten(-2)]
+
+    shape = x.log_B + log_shape(x.d.mean(-2), obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
+    rows.append((priors.shape * shape)[..., None])
+
+    whole, power = x.d + s, s.square().sum(-1, keepdim=True) + 1e-9
+    along = (whole * s).sum(-1, keepdim=True) / power
+    rows.append((priors.parallel[..., None, None] * (whole - along * s)).flatten(-2))
+    rows.append(priors.ratio_weight[..., None] * (along[..., 0].mean(-1, keepdim=True) - priors.ratio[..., None]))
+    if x.s is not None:
+        rows.append((priors.s_weight[..., None, None] * (x.s - obs.s_basis)).flatten(-2))
+    return torch.cat(rows, -1)
+
+
+def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Tensor, "rows"]:
+    """Priors of the shared parameters (method: a physical lobe is bounded and about the mirror direction)."""
+    C_1 = shared[:3] / cosine
+    mean = C_1.mean()
+    log_C_1 = (-mean).clamp_min(1e-3).log()
+    excess = shared[LOG_N_S].exp() * log_C_1 - torch.log(shared.new_tensor(priors.height))
+    return torch.stack(
+        [
+            *((C_1 / mean - 1.0) / priors.common_sd),
+            (shared[LOG_C_2] - log_C_1 - torch.log(shared.new_tensor(2.0))) / priors.mirror_sd,
+            excess.clamp_min(0.0) / priors.height_sd,
+            shared[SOFTNESS] / priors.softness_sd,
+            shared[ROOT_HAZE] / priors.haze_sd,
+        ]
+    )
+
+
+def build_problem(obs: Observations, priors: Priors, *, robust: float | None) -> BlockProblem:
+    """The whole problem; `robust` is the Huber threshold of the pictures' residuals in standard deviations."""
+
+    def residual(local: Tensor, shared: Tensor, *data: Tensor) -> Tensor:
+        return pixel_residual(local, shared, *regroup(data, obs, priors))
+
+    prior_rows = 1 + 3 * obs.channels + 1
+    threshold = None
+    if robust is not None:
+        picture = obs.images.new_full((obs.images[0].numel(),), robust)
+        threshold = torch.cat([picture, picture.new_full((prior_rows + 3 * obs.channels,), torch.inf)])
+    return BlockProblem(
+        residual=residual,
+        data=(
+            obs.images,
+            obs.s,
+            obs.weight,
+            obs.clipped,
+            priors.parallel,
+            priors.ratio,
+            priors.ratio_weight,
+            priors.s_weight,
+        ),
+        threshold=threshold,
+        shared_residual=lambda shared: shared_residual(shared, obs.cosine, priors),
+    )
+
+
+def regroup(data: tuple[Tensor, ...], obs: Observations, priors: Priors) -> tuple[Observations, Priors]:
+    """The solver's per-block tensors, back in their named places."""
+    images, s, weight, clipped, parallel, ratio, ratio_weight, s_weight = data
+    return (
+        replace(obs, images=images, s=s, weight=weight, clipped=clipped),
+        replace(priors, parallel=parallel, ratio=ratio, ratio_weight=ratio_weight, s_weight=s_weight),
+    )

@@ -1,0 +1,224 @@
+"""From start values to the joint optimum of all pixels: the paper's two steps, and everything together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.fit.neighbours import local_median
+from reflectsep.fit.problem import (
+    LOG_N_D,
+    LOG_N_S,
+    ROOT_HAZE,
+    SOFTNESS,
+    Locals,
+    Observations,
+    Priors,
+    build_problem,
+    unpack,
+    unpack_globals,
+)
+from reflectsep.fit.search import globals_grid, scan
+from reflectsep.model import lobe, lobe_argument, signed_root
+from reflectsep.solve.joint import JointOptions, JointSolution, local_in_chunks, solve_joint
+from reflectsep.solve.local import Termination
+
+Report = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """How hard to try."""
+
+    minima: int = 4
+    """Minima of every pixel that are polished."""
+    polish: Termination = field(default_factory=lambda: Termination(max_iterations=60))
+    joint: JointOptions = field(default_factory=lambda: JointOptions(max_iterations=20))
+    trim: float = 0.8
+    """Share of the chosen pixels that has a vote on the globals: those that the model explains best."""
+    trim_all: float = 0.97
+    """The same when all pixels are fitted."""
+    rounds: int = 4
+    starts: int = 3
+    chunk: int = 1 << 15
+
+
+@dataclass(frozen=True)
+class LocalFit:
+    """Best local solutions, and how clearly they are best."""
+
+    local: Float[Tensor, "pixels P"]
+    cost: Float[Tensor, "pixels"]
+    runner_up: Float[Tensor, "pixels"]
+    """Cost of the best solution that is another one; inf if there is none."""
+    converged: Bool[Tensor, "pixels"]
+
+
+def fit_locals(
+    obs: Observations, priors: Priors, shared: Float[Tensor, "8"], effort: Effort, robust: float | None
+) -> LocalFit:
+    """Search over B, then LM from the best minima of every pixel, the globals held (the paper's second step)."""
+    parts = []
+    for start in range(0, len(obs), effort.chunk):
+        index = torch.arange(start, min(start + effort.chunk, len(obs)))
+        parts.append(fit_chunk(obs.take(index), priors.take(index), shared, effort, robust))
+    return LocalFit(*(torch.cat([getattr(p, name) for p in parts]) for name in LocalFit.__dataclass_fields__))
+
+
+def fit_chunk(obs: Observations, priors: Priors, shared: Tensor, effort: Effort, robust: float | None) -> LocalFit:
+    """`fit_locals` on one chunk."""
+    candidates = scan(obs, priors, shared, keep=effort.minima)
+    problem = build_problem(obs, priors, robust=robust)
+    best: LocalFit | None = None
+    for k in range(effort.minima):
+        exists = candidates.cost[:, k].isfinite()
+        which = exists.nonzero()[:, 0]
+        if len(which) == 0:
+            continue
+        start = pack_start(obs.take(which), candidates.d[which, k], candidates.log_B[which, k])
+        part = local_in_chunks(problem.take(which), start, shared, effort.polish, effort.chunk)
+        best = merge(best, which, part.local, part.cost, part.converged, len(obs))
+    assert best is not None  # every scan has a minimum
+    return best
+
+
+def pack_start(obs: Observations, d: Tensor, log_B: Tensor) -> Tensor:
+    """A start as the solver's row; s joins the unknowns where it is one."""
+    return Locals(d, log_B, obs.s_basis if obs.s_unknown else None).pack()
+
+
+def merge(
+    best: LocalFit | None, which: Tensor, local: Tensor, cost: Tensor, converged: Tensor, pixels: int
+) -> LocalFit:
+    """The better of what was and what has been found at the pixels `which`."""
+    if best is None:
+        empty = local.new_full((pixels,), torch.inf)
+        best = LocalFit(local.new_zeros(pixels, local.shape[1]), empty, empty.clone(), empty.isnan())
+    old, new_cost = best.cost[which], cost.nan_to_num(nan=torch.inf)
+    better = new_cost < old
+    other = (local - best.local[which]).abs().amax(-1) > 0.02 * local.abs().amax(-1)
+    loser = torch.where(better, old, new_cost)
+    runner_up = torch.where(other, torch.minimum(best.runner_up[which], loser), best.runner_up[which])
+    result = LocalFit(best.local.clone(), best.cost.clone(), best.runner_up.clone(), best.converged.clone())
+    result.local[which] = torch.where(better[:, None], local, best.local[which])
+    result.cost[which] = torch.where(better, new_cost, old)
+    result.runner_up[which] = runner_up
+    result.converged[which] = torch.where(better, converged, best.converged[which])
+    return result
+
+
+def fit_globals(
+    obs: Observations,
+    priors: Priors,
+    start: Float[Tensor, "8"],
+    free: Bool[Tensor, "8"],
+    effort: Effort,
+    robust: float | None,
+    report: Report,
+) -> Float[Tensor, "8"]:
+    """The globals from chosen pixels (the paper's first step): grid, then search and joint fit in turn.
+
+    Only the `trim` share of the pixels that the model explains best takes part in a joint fit: one pixel in a wrong
+    minimum outweighs a hundred good ones.
+    """
+    number = max(4, int(effort.trim * len(obs)))
+    results = []
+    starts = globals_grid(obs, priors, start, trim=effort.trim, best=effort.starts)
+    for i, trial in enumerate(starts):
+        shared = trial
+        for _ in range(effort.rounds):
+            found = fit_locals(obs, priors, shared, effort, robust)
+            keep = found.cost.argsort()[:number]
+            problem = build_problem(obs.take(keep), priors.take(keep), robust=robust)
+            joint = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
+            moved = float((joint.shared - shared).abs().max())
+            shared = joint.shared
+            if moved < 1e-3:
+                break
+        found = fit_locals(obs, priors, shared, effort, robust)
+        results.append((float(found.cost.sort().values[:number].sum()), i, shared))
+        report(i + 1, len(starts))
+    return min(results, key=lambda entry: entry[:2])[2]
+
+
+def fit_everything(
+    obs: Observations,
+    priors: Priors,
+    found: LocalFit,
+    shared: Float[Tensor, "8"],
+    free: Bool[Tensor, "8"],
+    effort: Effort,
+    robust: float | None,
+    report: Report,
+) -> JointSolution:
+    """Globals and all pixels jointly; pixels that the model cannot explain follow without a vote."""
+    number = max(4, int(effort.trim_all * len(obs)))
+    vote = found.cost.argsort()[:number]
+    problem = build_problem(obs, priors, robust=robust)
+    total = effort.joint.max_iterations
+    joint = solve_joint(
+        problem.take(vote), found.local[vote], shared, effort.joint, free=free, watch=lambda i, _: report(i, total)
+    )
+    local = found.local.clone()
+    local[vote] = joint.local
+    rest = torch.ones(len(obs), dtype=torch.bool)
+    rest[vote] = False
+    index = rest.nonzero()[:, 0]
+    if len(index):
+        local[index] = local_in_chunks(
+            problem.take(index), local[index], joint.shared, effort.polish, effort.chunk
+        ).local
+    return JointSolution(**{**joint.__dict__, "local": local})
+
+
+def hand_on_lobes(
+    obs: Observations,
+    priors: Priors,
+    found: LocalFit,
+    shared: Float[Tensor, "8"],
+    mask: Bool[Tensor, "height width"],
+    effort: Effort,
+    robust: float | None,
+    *,
+    radius: int,
+) -> LocalFit:
+    """Offer every pixel the median lobe of its neighbours as a start; it keeps the cheaper solution.
+
+    A lobe B d is a matter of shape alone, so neighbours share it whatever their albedo.
+    """
+    x = unpack(found.local, obs.channels)
+    lobe_vector = local_median(x.B[:, None] * x.d.mean(1), mask, radius)
+    globals_ = unpack_globals(shared, obs.n_d)
+    shine = lobe(globals_.a + lobe_vector, globals_.n_s, globals_.haze)
+    s = obs.s_basis if x.s is None else x.s
+    d = signed_root(obs.images[..., :3] - shine[:, None], float(globals_.n_d)) - s
+    # Where a basis light leaves the patch dark the root says nothing; keep the pixel's own.
+    d = torch.where(d + s > 0, d, x.d)
+    mean = d.mean((1, 2))
+    usable = (mean > 1e-6) & (lobe_vector.mean(-1) > 1e-6)
+    log_B = torch.where(usable, (lobe_vector.mean(-1) / mean.clamp_min(1e-9)).clamp_min(1e-9).log(), x.log_B)
+    start = Locals(d, log_B, x.s).pack()
+    problem = build_problem(obs, priors, robust=robust)
+    tried = local_in_chunks(problem, start, shared, effort.polish, effort.chunk)
+    which = torch.arange(len(obs))
+    return merge(found, which, tried.local, tried.cost, tried.converged, len(obs))
+
+
+def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) -> Float[Tensor, "8"]:
+    """Shared unknowns before any search: hard shadows, no haze."""
+    shared = like.new_zeros(8)
+    shared[:3] = -0.9 * cosine
+    shared[LOG_N_S] = torch.log(like.new_tensor(12.0 if n_s is None else n_s))
+    shared[SOFTNESS], shared[ROOT_HAZE] = 0.0, 0.0
+    shared[LOG_N_D] = torch.log(like.new_tensor(n_d))
+    return shared
+
+
+def lobe_pictures(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels lights"]:
+    """Off-specular value of every pixel and light."""
+    x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
+    return lobe(lobe_argument(x.d, x.B, g.a, obs.alpha), g.n_s, g.haze)

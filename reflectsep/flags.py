@@ -1,0 +1,59 @@
+"""Quality bits: every pixel that is not simply good can name its reasons."""
+
+from enum import IntFlag
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+
+class Flag(IntFlag):
+    """One bit a reason; a good pixel has none."""
+
+    OUTSIDE_MASK = 1 << 0
+    """Not on the object; parameters are zero there."""
+    SATURATED = 1 << 1
+    """Clipped in at least one full picture; those values enter the fit as lower bounds."""
+    INVALID_INPUT = 1 << 2
+    """Not a finite number in at least one picture; the pixel is not fitted."""
+    HOLE_FILLED = 1 << 3
+    """Part of its scattering was filled in, not measured (every pixel that a slab lit)."""
+    NO_SWEEP_COVERAGE = 1 << 4
+    """At least one sweep never lit it: its scattering is a lower bound."""
+    SWEEP_SATURATED = 1 << 5
+    """Clipped in slab frames other than those that light it."""
+    FAINT_LOBE = 1 << 6
+    """The highlight never rises above the noise: B comes from the prior."""
+    NOT_CONVERGED = 1 << 7
+    """The solver stopped at its iteration limit."""
+    AMBIGUOUS = 1 << 8
+    """Two solutions of nearly equal cost; neighbours and the prior chose."""
+    ATTACHED_SHADOW = 1 << 9
+    """Faces away from at least one basis light (d < 0 there)."""
+    SHADOW_OR_OUTLIER = 1 << 10
+    """At least one picture disagrees beyond noise and was weighed down (cast shadow, inter-reflection)."""
+    UNDEREXPOSED = 1 << 11
+    """Below the noise floor in every basis picture."""
+
+
+def decode(value: int) -> list[str]:
+    """Names of the bits set in `value`, lowest first.
+
+    Raises:
+        ValueError: `value` has a bit that no flag names.
+    """
+    return [flag.name for flag in Flag if flag & Flag(value)]
+
+
+def count(flags: Int[Tensor, "height width"]) -> dict[str, int]:
+    """Number of pixels that carry each flag, every flag named, absent ones as 0."""
+    bits = flags.detach().cpu().to(torch.int64).numpy()
+    return {flag.name: int(np.count_nonzero(bits & flag.value)) for flag in Flag}
+
+
+def mark(
+    flags: Int[Tensor, "height width"], where: Tensor, flag: Flag
+) -> Int[Tensor, "height width"]:
+    """`flags` with `flag` added at the true pixels of `where` (height, width)."""
+    return torch.where(where, flags | int(flag), flags)

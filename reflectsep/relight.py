@@ -1,0 +1,228 @@
+"""Pictures under lights never taken: from light vectors to alpha (Eq. 15), and from alpha to a folder of EXRs.
+
+There is no model in here; whatever can be relit is asked for the pictures.
+
+**Intensity.** Light adds in radiance: a lamp twice as bright makes every pixel twice as bright, highlights too. Alpha
+does not do that: scaled by g, it scales the diffuse part by g^n_d and the lobe by g^n_s (Eq. 21). So a light to relight
+with is a direction at the brightness of the basis lights, which gives its alpha, and a gain on the picture.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from reflectsep.data import Light, Vector
+from reflectsep.errors import LightError
+from reflectsep.io.exr import write_channels
+from reflectsep.io.files import atomic_folder, write_json
+
+MARKER = "relit.json"
+"""In every folder of relit pictures: the alpha and gain of each, and the sign that the folder may be replaced."""
+
+Progress = Callable[[int, int], None]
+"""Called with (pictures done, pictures in all)."""
+
+
+class Relightable(Protocol):
+    """What can be relit; a separation, in short."""
+
+    def relight(self, alpha: Tensor, /) -> Tensor:
+        """Pictures (..., channels, height, width) for alpha (..., 3)."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightMix:
+    """A light to relight with."""
+
+    alpha: Vector
+    """Mix of the basis lights at their brightness (Eq. 15)."""
+    gain: tuple[float, ...] = (1.0,)
+    """Factor on the picture, one for all or one a channel."""
+
+
+def alphas_for(lights: Sequence[Light], basis: Float[Tensor, "lights 3"] | None) -> dict[str, LightMix]:
+    """What every light is as a mix of the basis lights, by name.
+
+    Args:
+        lights: with directions; their intensity, of one value or one a channel, is in the unit of the basis lights'.
+        basis: direction times intensity of the basis lights in its first three rows; None where they are unknown.
+
+    Raises:
+        LightError: a light without direction, with an intensity that is negative or not a number, a name given twice or
+            unfit for a file; no light at all; basis lights that are unknown or coplanar.
+    """
+    if basis is None:
+        raise LightError(
+            "the result's basis lights have no directions, so a direction means nothing: give alpha instead"
+        )
+    vectors = basis[:3].detach().double().cpu()
+    brightness = float(vectors.norm(dim=1).log().mean().exp())
+    if not math.isfinite(brightness) or float(torch.linalg.svdvals(vectors)[2]) <= 1e-6 * brightness:
+        raise LightError("the result's basis lights are coplanar; expected three directions that span space")
+    if not lights:
+        raise LightError("no lights to relight with; expected at least one")
+    mixes: dict[str, LightMix] = {}
+    for light in lights:
+        name = safe_name(light.name)
+        if name.lower() in {taken.lower() for taken in mixes}:
+            raise LightError(f"light {name}: the name appears twice (case aside); every light needs a file of its own")
+        unit = _unit(light)
+        alpha = torch.linalg.solve(vectors.mT, brightness * unit)
+        gain = tuple(value / brightness for value in _intensity(light))
+        mixes[name] = LightMix(alpha=(float(alpha[0]), float(alpha[1]), float(alpha[2])), gain=gain)
+    return mixes
+
+
+def orbit(count: int, elevation_deg: float, *, start_deg: float = 0.0, intensity: float = 1.0) -> tuple[Light, ...]:
+    """Lights on a circle round the view axis, counter-clockwise from x, named `orbit_0000` and so on.
+
+    Args:
+        count: of lights, evenly spaced; the circle is closed, so that the pictures loop.
+        elevation_deg: above the picture plane; 90 is along the view axis.
+        start_deg: azimuth of the first.
+        intensity: of each, in the unit of the basis lights'.
+
+    Raises:
+        LightError: no lights, or an elevation outside (0, 90].
+    """
+    if count < 1 or not 0 < elevation_deg <= 90:
+        raise LightError(
+            f"orbit of {count} lights at {elevation_deg:g} degrees: expected at least 1, in (0, 90] degrees"
+        )
+    up, out = math.sin(math.radians(elevation_deg)), math.cos(math.radians(elevation_deg))
+    lights = []
+    for i in range(count):
+        azimuth = math.radians(start_deg + 360.0 * i / count)
+        direction = (out * math.cos(azimuth), out * math.sin(azimuth), up)
+        lights.append(Light(name=f"orbit_{i:04d}", direction=direction, intensity=(intensity,)))
+    return tuple(lights)
+
+
+def relight_to_folder(
+    separation: Relightable,
+    lights: Mapping[str, LightMix | Sequence[float] | Tensor],
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    chunk: int = 4,
+) -> tuple[Path, ...]:
+    """Write `NAME.exr` (float32, linear, channels R G B or Y) for every light; all of them, or nothing at all.
+
+    Args:
+        separation: to be relit.
+        lights: by name: a mix, or a bare alpha of three numbers.
+        out: folder to make.
+        overwrite: replace a folder of relit pictures that is there.
+        progress: told after every picture.
+        chunk: pictures relit at a time, which bounds memory.
+
+    Returns:
+        The files written, in the order of `lights`.
+
+    Raises:
+        LightError: no lights, a name unfit for a file, an alpha that is not three finite numbers.
+        ResultError: `out` exists and may not be replaced.
+    """
+    mixes = {safe_name(name): _as_mix(name, value) for name, value in lights.items()}
+    if not mixes:
+        raise LightError("no lights to relight with; expected at least one")
+    if len({name.lower() for name in mixes}) < len(mixes):
+        raise LightError("two lights share a name (case aside); every light needs a file of its own")
+    with atomic_folder(out, overwrite) as folder:
+        for done, (name, picture) in enumerate(relit_pictures(separation, mixes, chunk=chunk), start=1):
+            write_channels(folder / f"{name}.exr", _channels(picture))
+            if progress is not None:
+                progress(done, len(mixes))
+        document = {name: {"alpha": list(mix.alpha), "gain": list(mix.gain)} for name, mix in mixes.items()}
+        write_json(folder / MARKER, {"format": "reflectsep-relit/1", "lights": document})
+    return tuple(Path(out) / f"{name}.exr" for name in mixes)
+
+
+def relit_pictures(
+    separation: Relightable, mixes: Mapping[str, LightMix], *, chunk: int = 4
+) -> Iterator[tuple[str, Float[Tensor, "channels height width"]]]:
+    """The pictures of `mixes` one after the other, relit `chunk` at a time.
+
+    Raises:
+        LightError: a gain with neither one value nor one a channel; a relit picture that is not finite.
+    """
+    names = list(mixes)
+    for start in range(0, len(names), chunk):
+        part = names[start : start + chunk]
+        with torch.no_grad():
+            pictures = separation.relight(torch.tensor([mixes[name].alpha for name in part], dtype=torch.float32))
+        for name, picture in zip(part, pictures, strict=True):
+            gain = torch.tensor(mixes[name].gain, dtype=picture.dtype, device=picture.device)
+            if gain.numel() not in (1, picture.shape[0]):
+                found, channels = gain.numel(), picture.shape[0]
+                raise LightError(f"light {name}: intensity of {found} values for a picture of {channels} channels")
+            lit = picture * gain[:, None, None]
+            if not bool(torch.isfinite(lit).all()):
+                raise LightError(f"light {name}: the relit picture is not finite; its alpha or intensity is too large")
+            yield name, lit
+
+
+def safe_name(name: str) -> str:
+    """`name`, sure to be that of a plain file on any system.
+
+    Raises:
+        LightError: it is empty or too long, starts with a dot, or has a separator or other unusual character in it.
+    """
+    if not re.fullmatch(r"[\w\-+=@#~(),][\w\-+=@#~(), .]{0,119}", name) or name.endswith((" ", ".")):
+        raise LightError(
+            f"light name {name!r} cannot name a file: letters, digits, '-', '_', '.' and spaces are expected"
+        )
+    return name
+
+
+def _unit(light: Light) -> Tensor:
+    """Direction of `light`, of length 1."""
+    if light.direction is None:
+        raise LightError(f"light {light.name}: has no direction; expected three numbers [x, y, z]")
+    vector = torch.tensor(light.direction, dtype=torch.float64)
+    length = float(vector.norm())
+    if not math.isfinite(length) or length < 1e-9:
+        raise LightError(f"light {light.name}: direction {list(light.direction)} is zero or not finite")
+    return vector / length
+
+
+def _intensity(light: Light) -> tuple[float, ...]:
+    """Intensity of `light`, checked."""
+    if not light.intensity or not all(math.isfinite(value) and value >= 0 for value in light.intensity):
+        raise LightError(
+            f"light {light.name}: intensity {list(light.intensity)}; expected finite numbers, none negative"
+        )
+    return light.intensity
+
+
+def _as_mix(name: str, value: LightMix | Sequence[float] | Tensor) -> LightMix:
+    """A `LightMix` from any of its spellings."""
+    if isinstance(value, LightMix):
+        mix = value
+    else:
+        numbers = [float(number) for number in torch.as_tensor(value).reshape(-1)]
+        if len(numbers) != 3:
+            raise LightError(f"light {name}: alpha of {len(numbers)} numbers; expected three")
+        mix = LightMix(alpha=(numbers[0], numbers[1], numbers[2]))
+    if not all(math.isfinite(number) for number in (*mix.alpha, *mix.gain)):
+        raise LightError(f"light {name}: alpha {list(mix.alpha)}, gain {list(mix.gain)}; expected finite numbers")
+    return mix
+
+
+def _channels(picture: Tensor) -> dict[str, np.ndarray]:
+    """Channels of an EXR file: Y, or R G B."""
+    names = ("Y",) if picture.shape[0] == 1 else ("R", "G", "B")
+    planes = picture.detach().float().cpu().numpy()
+    return dict(zip(names, planes, strict=True))

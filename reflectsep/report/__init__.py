@@ -1,0 +1,1 @@
+"""What people look at: figures, previews, and the numbers under them."""

@@ -1,0 +1,1 @@
+"""Batched Gauss-Newton / Levenberg-Marquardt. Generic: knows no light and no image."""

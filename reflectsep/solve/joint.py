@@ -1,0 +1,191 @@
+"""Gauss-Newton on blocks and shared parameters together, by the Schur complement.
+
+    [ V    W ] [dl]     [gl]
+    [ W^T  H ] [dg] = - [gg],       V block diagonal (one block a pixel), W (P, G) a block, H (G, G)
+
+    S dg = -(gg - W^T V^-1 gl),     S = H - W^T V^-1 W,     dl = -V^-1 (gl + W dg)
+
+Only S and the reduced gradient are summed over blocks, a handful of numbers a chunk, so memory is bounded by the
+chunk and chunks may live anywhere. One damping for everything is a poor solver: blocks are damped each on its own by
+a few local iterations after every shared step (variable projection), the shared parameters by theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.solve.local import LocalSolution, Termination, normal_equations, solve_local
+from reflectsep.solve.problem import BlockProblem, robust_weight
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOptions:
+    """How the shared parameters are stepped and when they are done."""
+
+    max_iterations: int = 40
+    tolerance: float = 1e-7
+    """Stop where the relative decrease of the total cost stays below this twice in a row."""
+    inner: Termination = Termination(max_iterations=6)
+    """Local iterations after every shared step."""
+    chunk: int = 1 << 16
+    damping: float = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointSolution:
+    """Where blocks and shared parameters ended."""
+
+    local: Float[Tensor, "blocks P"]
+    shared: Float[Tensor, "G"]
+    cost: float
+    information: Float[Tensor, "G G"]
+    """S: inverse covariance of the shared parameters, the blocks marginalised."""
+    iterations: int
+    converged: bool
+    history: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class ReducedSystem:
+    """The shared parameters' own normal equations after the blocks are eliminated; systems of chunks add."""
+
+    S: Tensor
+    gradient: Tensor
+
+
+def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: int) -> ReducedSystem:
+    """S and the reduced gradient at (local, shared), chunk by chunk."""
+    G = len(shared)
+    S, gradient = shared.new_zeros(G, G), shared.new_zeros(G)
+    for start in range(0, len(local), chunk):
+        cut = slice(start, start + chunk)
+        part = problem.take(cut)
+        r, J, K = part.linearise(local[cut], shared)
+        weight = robust_weight(r, part.threshold)
+        V, gl = normal_equations(r, J, weight)
+        weighted = K * weight[..., None]
+        W = J.mT @ weighted
+        V_inv = inverse(V)
+        S += torch.einsum("nmg,nmh->gh", weighted, K) - torch.einsum("npg,npq,nqh->gh", W, V_inv, W)
+        gradient += torch.einsum("nmg,nm->g", weighted, r) - torch.einsum("npg,npq,nq->g", W, V_inv, gl)
+    if problem.shared_residual is not None:
+        q = problem.shared_residual(shared)
+        Q = torch.func.jacfwd(problem.shared_residual)(shared)
+        S, gradient = S + Q.mT @ Q, gradient + Q.mT @ q
+    return ReducedSystem(S, gradient)
+
+
+def shared_step(system: ReducedSystem, mu: float, free: Tensor | None) -> Tensor:
+    """-(S + mu diag S)^-1 gradient over the free parameters, 0 for the others."""
+    G = len(system.gradient)
+    index = torch.arange(G) if free is None else free.nonzero()[:, 0]
+    S = system.S[index][:, index]
+    S = S + mu * torch.diag(S.diagonal().clamp_min(1e-30))
+    step = torch.zeros_like(system.gradient)
+    step[index] = -torch.linalg.solve(S, system.gradient[index])
+    return step
+
+
+def inverse(V: Float[Tensor, "blocks P P"]) -> Float[Tensor, "blocks P P"]:
+    """V^-1 of every block; directions that no residual feels get no say instead of an infinite one."""
+    diagonal = V.diagonal(dim1=-2, dim2=-1)
+    unit = diagonal.clamp_min(1e-12 * diagonal.amax(-1, keepdim=True)).clamp_min(1e-30).rsqrt()
+    system = V * unit[..., :, None] * unit[..., None, :]
+    system = system + 1e-9 * torch.eye(V.shape[-1], dtype=V.dtype, device=V.device)
+    factor, info = torch.linalg.cholesky_ex(system)
+    result = torch.cholesky_inverse(factor) * unit[..., :, None] * unit[..., None, :]
+    return torch.where((info == 0)[..., None, None], result, torch.zeros_like(result))
+
+
+def follow(problem: BlockProblem, local: Tensor, shared: Tensor, step: Tensor, chunk: int) -> Tensor:
+    """Blocks moved along with the shared step, dl = -V^-1 (gl + W dg), each only where that lowers its cost.
+
+    Along a flat valley (here: a against B) blocks that wait for their own iterations would make every shared step
+    look bad.
+    """
+    result = local.clone()
+    for start in range(0, len(local), chunk):
+        cut = slice(start, start + chunk)
+        part = problem.take(cut)
+        r, J, K = part.linearise(local[cut], shared)
+        weight = robust_weight(r, part.threshold)
+        V, gl = normal_equations(r, J, weight)
+        pull = gl + (J.mT @ (weight * (K @ step))[..., None])[..., 0]
+        moved = local[cut] - (inverse(V) @ pull[..., None])[..., 0]
+        better = part.costs(moved, shared + step) < part.costs(local[cut], shared + step)
+        result[cut] = torch.where(better[:, None], moved, local[cut])
+    return result
+
+
+def local_in_chunks(
+    problem: BlockProblem, local: Tensor, shared: Tensor, termination: Termination, chunk: int
+) -> LocalSolution:
+    """`solve_local`, chunk by chunk."""
+    parts = [
+        solve_local(problem.take(slice(i, i + chunk)), local[i : i + chunk], shared, termination)
+        for i in range(0, len(local), chunk)
+    ]
+    return LocalSolution(
+        local=torch.cat([p.local for p in parts]),
+        cost=torch.cat([p.cost for p in parts]),
+        converged=torch.cat([p.converged for p in parts]),
+        iterations=max(p.iterations for p in parts),
+    )
+
+
+def solve_joint(
+    problem: BlockProblem,
+    local: Float[Tensor, "blocks P"],
+    shared: Float[Tensor, "G"],
+    options: JointOptions = JointOptions(),
+    *,
+    free: Bool[Tensor, "G"] | None = None,
+    watch: Callable[[int, float], None] | None = None,
+) -> JointSolution:
+    """Minimise the whole cost over blocks and shared parameters from (local, shared).
+
+    Shared parameters where `free` is false stay as they are; `watch(iteration, cost)` is called after every step.
+    """
+    inner = local_in_chunks(problem, local, shared, options.inner, options.chunk)
+    local = inner.local
+    cost = float(inner.cost.sum() + problem.shared_cost(shared))
+    history, mu, quiet, converged, iteration = [cost], options.damping, 0, False, 0
+    for iteration in range(1, options.max_iterations + 1):
+        system = reduced_system(problem, local, shared, options.chunk)
+        accepted = False
+        while mu < 1e8:
+            step = shared_step(system, mu, free)
+            moved = follow(problem, local, shared, step, options.chunk)
+            trial = local_in_chunks(problem, moved, shared + step, options.inner, options.chunk)
+            trial_cost = float(trial.cost.sum() + problem.shared_cost(shared + step))
+            if trial_cost < cost:
+                accepted = True
+                break
+            mu *= 8.0
+        if not accepted:
+            converged = True
+            break
+        decrease = cost - trial_cost
+        local, shared, cost = trial.local, shared + step, trial_cost
+        mu = max(mu * 0.2, 1e-9)
+        history.append(cost)
+        if watch is not None:
+            watch(iteration, cost)
+        quiet = quiet + 1 if decrease <= options.tolerance * cost else 0
+        if quiet >= 2:
+            converged = True
+            break
+    return JointSolution(
+        local=local,
+        shared=shared,
+        cost=cost,
+        information=reduced_system(problem, local, shared, options.chunk).S,
+        iterations=iteration,
+        converged=converged,
+        history=tuple(history),
+    )

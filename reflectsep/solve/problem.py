@@ -1,0 +1,101 @@
+"""A least-squares problem of many small blocks that share a few parameters.
+
+Block p (a pixel) has its own unknowns l_p and all blocks share g:
+
+    cost(l, g) = sum_p sum_m rho_m( r_pm(l_p, g) )  +  1/2 |q(g)|^2
+
+r is written by the caller for a whole batch of blocks at once. Its derivatives come from forward-mode automatic
+differentiation: blocks do not see each other, so one tangent per unknown, laid over the whole batch, gives a full
+column of every block's Jacobian. A caller may supply a closed form instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.func import jvp, vmap
+
+Residual = Callable[..., Tensor]
+Jacobians = Callable[..., tuple[Tensor, Tensor, Tensor]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockProblem:
+    """Residuals of all blocks, with the data that each block needs."""
+
+    residual: Residual
+    """(local (blocks, P), shared (G,), *data) -> (blocks, M), whitened."""
+    data: tuple[Tensor, ...]
+    """Per-block constants, each (blocks, ...)."""
+    threshold: Float[Tensor, "residuals"] | None = None
+    """Huber threshold of every residual, in units of the residual; inf is plain least squares. None: all plain."""
+    shared_residual: Callable[[Tensor], Tensor] | None = None
+    """q: residuals of the shared parameters alone, (G,) -> (R,)."""
+    jacobian: Jacobians | None = None
+    """Closed form: (local, shared, *data) -> r (blocks, M), dr/dl (blocks, M, P), dr/dg (blocks, M, G)."""
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self.data[0])
+
+    def take(self, index: Int[Tensor, "some"] | slice) -> BlockProblem:
+        """The same problem on some of the blocks."""
+        return replace(self, data=tuple(d[index] for d in self.data))
+
+    def residuals(self, local: Tensor, shared: Tensor) -> Tensor:
+        """r, (blocks, M)."""
+        return self.residual(local, shared, *self.data)
+
+    def costs(self, local: Tensor, shared: Tensor) -> Float[Tensor, "blocks"]:
+        """Cost of every block."""
+        return robust_cost(self.residuals(local, shared), self.threshold)
+
+    def shared_cost(self, shared: Tensor) -> Tensor:
+        """1/2 |q|^2."""
+        if self.shared_residual is None:
+            return shared.new_zeros(())
+        return 0.5 * self.shared_residual(shared).square().sum()
+
+    def linearise(self, local: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """r and its derivatives by l and by g at (local, shared)."""
+        if self.jacobian is not None:
+            return self.jacobian(local, shared, *self.data)
+        return forward_jacobian(self.residual, local, shared, self.data)
+
+
+def forward_jacobian(
+    residual: Residual, local: Tensor, shared: Tensor, data: tuple[Tensor, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """r (blocks, M), dr/dl (blocks, M, P) and dr/dg (blocks, M, G), by forward mode over the whole batch."""
+    P, G = local.shape[-1], shared.shape[-1]
+    basis = torch.eye(P + G, dtype=local.dtype, device=local.device)
+
+    def column(tangent: Tensor) -> tuple[Tensor, Tensor]:
+        return jvp(
+            lambda l, g: residual(l, g, *data),
+            (local, shared),
+            (tangent[:P].expand_as(local).contiguous(), tangent[P:].contiguous()),
+        )
+
+    values, columns = vmap(column, out_dims=(0, -1))(basis)
+    return values[0], columns[..., :P], columns[..., P:]
+
+
+def robust_cost(r: Float[Tensor, "blocks residuals"], threshold: Tensor | None) -> Float[Tensor, "blocks"]:
+    """Sum over residuals of r^2 / 2 within the threshold and of t (|r| - t / 2) beyond it (Huber)."""
+    if threshold is None:
+        return 0.5 * r.square().sum(-1)
+    size = r.abs()
+    linear = threshold * size - 0.5 * threshold * torch.where(threshold.isfinite(), threshold, 0.0)
+    return torch.where(size <= threshold, 0.5 * r.square(), linear).nan_to_num(nan=torch.inf).sum(-1)
+
+
+def robust_weight(r: Float[Tensor, "blocks residuals"], threshold: Tensor | None) -> Tensor:
+    """rho'(r) / r: the weight of every residual in the Gauss-Newton system."""
+    if threshold is None:
+        return torch.ones_like(r)
+    return (threshold / r.abs().clamp_min(torch.finfo(r.dtype).tiny)).clamp_max(1.0)

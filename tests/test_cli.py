@@ -1,0 +1,269 @@
+"""The command line: exit codes, one line an error, several runs; the pipeline is a stand-in."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import reflectsep
+from reflectsep.cli import main
+from reflectsep.config import JOBS, FitJob, InfoJob, RelightJob, SimulateJob
+from reflectsep.errors import CaptureError
+
+STAND_IN = """
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import reflectsep
+from reflectsep.errors import CaptureError
+
+
+def run(job, progress):
+    progress("stage", 1, 1)
+    if getattr(job, "seed", 0) == 13:
+        raise CaptureError(job.out + ": unlucky")
+    Path(job.out).mkdir(parents=True)
+    return "wrote " + job.out
+
+
+pipeline = ModuleType("reflectsep.pipeline")
+pipeline.run_simulate = pipeline.run_fit = run
+sys.modules["reflectsep.pipeline"] = pipeline
+"""
+
+
+@pytest.fixture
+def ran(monkeypatch, tmp_path):
+    """Jobs that ran, in a folder of their own."""
+    jobs = []
+
+    def run(job, progress):
+        progress("stage", 1, 1)
+        jobs.append(job)
+        return "done"
+
+    pipeline = ModuleType("reflectsep.pipeline")
+    for name in JOBS:
+        setattr(pipeline, f"run_{name}", run)
+    monkeypatch.setitem(sys.modules, "reflectsep.pipeline", pipeline)
+    monkeypatch.setattr(reflectsep, "pipeline", pipeline, raising=False)
+    monkeypatch.chdir(tmp_path)
+    return jobs
+
+
+def fails(capsys, words, code):
+    """The one line on standard error of a command that fails."""
+    assert main(words) == code
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith("reflectsep: error: ")
+    return error.removeprefix("reflectsep: error: ").rstrip()
+
+
+def test_fit_takes_groups_and_paths(ran, capsys):
+    words = "capture=in out=there object=wax fit=lin_lee scatter=orthogonal rig=six overwrite=true"
+    assert main(["fit", *words.split()]) == 0
+    (job,) = ran
+    assert isinstance(job, FitJob)
+    assert (job.capture, job.out, job.overwrite) == ("in", "there", True)
+    assert (job.fit.scattering, job.scatter.hole_filling, job.object.name) == ("none", "orthogonal", "wax")
+    assert capsys.readouterr().out == "done\n"
+
+
+def test_lists_reach_the_job_with_their_types(ran):
+    assert main(["relight", "result=r", "direction=[0,1,2.5]"]) == 0
+    assert main(["fit", "capture=c", "heldout=[L7,8]"]) == 0
+    relight, fit = ran
+    assert isinstance(relight, RelightJob)
+    assert relight.direction == [0.0, 1.0, 2.5]
+    assert fit.heldout == ["L7", "8"]
+
+
+@pytest.mark.parametrize("path", ["captures/a", "007", "a=b (1), [2]", "it's", "true", "x y\\"])
+def test_info_takes_any_path(ran, path):
+    assert main(["info", path]) == 0
+    assert ran == [InfoJob(path=path)]
+
+
+def test_a_run_leaves_nothing_of_its_own(ran, tmp_path):
+    assert main(["fit", "capture=c"]) == 0
+    assert main(["fit", "-m", "object=wax,pudding"]) == 0
+    assert list(tmp_path.iterdir()) == []
+    assert Path.cwd() == tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("fit object=wax fit.n_ss=3", "fit.n_ss: no such setting; did you mean fit.n_s?"),
+        ("fit objct=wax", "objct: no such setting; did you mean object?"),
+        ("fit object=wux", "object=wux: no such option; did you mean wax? (one of generic, plastic, pudding, wax)"),
+        ("fit object=wax fit.n_s=abc", "fit.n_s=abc: expected a number or null"),
+        ("fit object=wax fit.max_iterations=1.5", "fit.max_iterations=1.5: expected a whole number"),
+        ("fit object=wax overwrite=3", "overwrite=3: expected true or false"),
+        ("fit object=wax fit.n_s=-3", "fit.n_s=-3.0: must be above 0"),
+        ("fit object=wax scatter.threshold=2", "scatter.threshold=2.0: must be at most 1"),
+        ("fit object=wax fit.method=jiont", "fit.method=jiont: expected joint or two_step; did you mean joint?"),
+        ("fit object=wax basis=L1", "basis=L1: expected a list of names or null"),
+        ("fit object=wax,pudding", "object=wax,pudding: several values mean several runs: add -m"),
+        ("fit object=wax object=pudding", "object=pudding: object is given twice"),
+        ("fit object", "object: expected KEY=VALUE"),
+        ("fit +more=1", "+more=1: settings are set by KEY=VALUE, none can be added or removed"),
+        ("fit ~fit", "~fit: expected KEY=VALUE"),
+        ("fit out=${no.such}", "out: Interpolation key 'no.such' not found"),
+        ("fit", "no capture: give capture=FOLDER, or object=NAME for captures/NAME"),
+        ("relight lights=a.lp", "no result: give result=... (result folder to relight)"),
+        ("relight result=r direction=[0,0,1", "direction=[0,0,1: cannot be read; quote a value that holds any of"),
+        ("info a b", "path='b': path is given twice"),
+        ("info", "no path: give path=..."),
+        ("fti", "fti: no such job; did you mean fit? (one of simulate, fit, relight, compare, info, demo)"),
+        ("fit --multrun", "--multrun: no such option; did you mean --multirun?"),
+        ("fit -m object=wax,wux", "object=wux: no such option; did you mean wax?"),
+        ("fit -m object=wax,pudding fit.n_s=3,-3", "fit.n_s=-3.0: must be above 0"),
+        ("fit -m object=wax fit.n_s=3,a", "fit.n_s=a: expected a number or null"),
+        ("fit -m object=wax,pudding hydra/launcher=jobs", "In 'hydra/config': Could not find 'hydra/launcher/jobs'"),
+        ("fit -m object=wax fit=joint,lin_lee", "object=wax fit=joint and object=wax fit=lin_lee: both would write "),
+    ],
+)
+def test_wrong_settings_are_one_line_and_nothing_runs(ran, capsys, words, line):
+    assert fails(capsys, words.split(), 2).startswith(line)
+    assert ran == []
+
+
+def test_no_job_shows_the_help_and_fails(capsys):
+    assert main([]) == 2
+    assert "usage: reflectsep JOB" in capsys.readouterr().err
+
+
+def test_multirun_runs_every_combination(ran):
+    assert main(["simulate", "--multirun", "object=wax,pudding", "rig=six,twelve"]) == 0
+    assert all(isinstance(job, SimulateJob) for job in ran)
+    assert [job.out for job in ran] == [
+        "captures/wax",
+        "captures/wax-twelve",
+        "captures/pudding",
+        "captures/pudding-twelve",
+    ]
+
+
+def test_multirun_tells_runs_apart_by_interpolation(ran):
+    assert main(["fit", "-m", "object=wax", "fit=joint,lin_lee", "out=results/${fit.scattering}"]) == 0
+    assert [job.out for job in ran] == ["results/measured", "results/none"]
+
+
+def test_cfg_prints_the_settings_and_runs_nothing(ran, capsys):
+    assert main(["fit", "object=pudding", "--cfg"]) == 0
+    printed = capsys.readouterr().out
+    assert "capture: captures/pudding\n" in printed
+    assert "  hole_filling: profile\n" in printed
+    assert ran == []
+
+
+@pytest.mark.parametrize("error", [CaptureError("a/b.exr: 3x4,\n but 5x6 expected"), OSError(28, "No space left")])
+def test_foreseen_errors_of_a_job_are_one_line(ran, capsys, monkeypatch, error):
+    def run(_job, _progress):
+        raise error
+
+    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    assert fails(capsys, ["fit", "capture=c"], 1) == " ".join(str(error).split())
+
+
+def test_a_bug_keeps_its_traceback(ran, monkeypatch):
+    def run(_job, _progress):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    with pytest.raises(ZeroDivisionError):
+        main(["fit", "capture=c"])
+    with pytest.raises(ZeroDivisionError):
+        main(["fit", "-m", "object=wax"])
+
+
+@pytest.mark.parametrize("words", [["fit", "capture=c"], ["fit", "-m", "object=wax,pudding"]])
+def test_interruption_is_one_line(ran, capsys, monkeypatch, words):
+    def run(_job, _progress):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    assert main(words) == 130
+    assert capsys.readouterr().err.split("\n") == ["", "reflectsep: interrupted", ""]
+
+
+def test_a_run_that_fails_stops_no_other(ran, capsys, monkeypatch):
+    def run(job, _progress):
+        if job.object.name == "wax":
+            raise CaptureError("captures/wax: melted")
+        ran.append(job)
+
+    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    assert fails(capsys, ["fit", "-m", "object=wax,pudding"], 1) == "object=wax: captures/wax: melted"
+    assert [job.object.name for job in ran] == ["pudding"]
+
+
+@pytest.fixture
+def command(tmp_path):
+    """Runs the command in a process of its own (as do its worker processes) with the stand-in for a pipeline."""
+    hook = tmp_path / "hook"
+    hook.mkdir()
+    (hook / "sitecustomize.py").write_text(STAND_IN)
+    package = str(Path(reflectsep.__file__).parent.parent)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(hook), package]), "OMP_NUM_THREADS": "1"}
+    work = tmp_path / "work"
+    work.mkdir()
+
+    def run(*words):
+        arguments = [sys.executable, "-m", "reflectsep", *words]
+        return subprocess.run(arguments, cwd=work, env=environment, capture_output=True, text=True, check=False)
+
+    run.work = work
+    return run
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_launchers_leave_only_what_the_jobs_wrote(command, launcher):
+    if launcher == "joblib":
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    done = command("simulate", "-m", "object=wax,pudding", f"hydra/launcher={launcher}")
+    assert (done.returncode, sorted(done.stdout.splitlines())) == (0, ["wrote captures/pudding", "wrote captures/wax"])
+    found = sorted(str(path.relative_to(command.work)) for path in command.work.rglob("*"))
+    assert found == ["captures", "captures/pudding", "captures/wax"]
+
+
+def test_joblib_reports_a_failure_in_one_line(command):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    done = command("simulate", "-m", "seed=1,13", "out=a${seed}", "hydra/launcher=joblib")
+    errors = [line for line in done.stderr.splitlines() if "error" in line.lower()]
+    assert (done.returncode, errors) == (1, ["reflectsep: error: seed=13: a13: unlucky"])
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in command.work.iterdir()] == ["a1"]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["fit", "--help"], ["--version"]])
+def test_help_comes_at_once_and_imports_nothing_heavy(words):
+    program = (
+        "import sys; from reflectsep.cli import main; code = main(sys.argv[1:]);"
+        "heavy = {'torch', 'hydra', 'omegaconf', 'numpy', 'rich', 'yaml'} & set(sys.modules);"
+        "sys.exit(f'imported {heavy}' if heavy else code)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(reflectsep.__file__).parent.parent)}
+    started_s = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert time.monotonic() - started_s < 1.0
+
+
+def test_help_lists_every_job_and_every_option(capsys):
+    assert main(["--help"]) == 0
+    overview = capsys.readouterr().out
+    assert all(f"\n  {job} " in overview for job in JOBS)
+    assert main(["fit", "--help"]) == 0
+    text = capsys.readouterr().out
+    for word in ("capture=", "fit=lin_lee", "fit.n_s=null", "scatter=orthogonal", "scatter.threshold=0.25", "rig=six"):
+        assert word in text

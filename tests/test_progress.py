@@ -1,0 +1,67 @@
+"""Progress on a terminal and elsewhere."""
+
+import io
+
+import pytest
+
+from reflectsep import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_one_line_for_every_stage_however_many_steps():
+    stream = io.StringIO()
+    with progress.shown(stream=stream) as show:
+        for done in range(1, 51):
+            show("sweep L1", done, 50)
+        show("fit", 0, 100)
+        show("fit", 7, 100)  # converged early: its line comes all the same
+    lines = stream.getvalue().splitlines()
+    assert [line.split(":")[0] for line in lines] == ["sweep L1", "fit"]
+
+
+def test_prefix_tells_runs_apart():
+    stream = io.StringIO()
+    with progress.shown("object=wax: ", stream=stream) as show:
+        show("fit", 1, 1)
+    assert stream.getvalue().startswith("object=wax: fit: ")
+
+
+def test_failed_stage_writes_no_line():
+    stream = io.StringIO()
+
+    def fail():
+        with progress.shown(stream=stream) as show:
+            show("fit", 1, 9)
+            raise ValueError("broken")
+
+    with pytest.raises(ValueError, match="broken"):
+        fail()
+    assert stream.getvalue() == ""
+
+
+def test_bars_know_their_end():
+    stream = Terminal()
+    with progress.shown(stream=stream) as show:
+        show("sweep L1", 3, 60)
+        show("sweep L1", 60, 60)
+    assert "60/60" in stream.getvalue()
+
+
+def test_bar_of_a_stage_that_ended_early_is_full():
+    stream = Terminal()
+    with progress.shown(stream=stream) as show:
+        show("fit", 7, 60)
+        show("write", 1, 1)
+    assert "7/7" in stream.getvalue()
+
+
+def test_parallel_runs_share_a_terminal_by_lines():
+    stream = Terminal()
+    with progress.shown("a: ", parallel=True, stream=stream) as show:
+        show("fit", 1, 1)
+    assert "\x1b" not in stream.getvalue()
+    assert stream.getvalue().startswith("a: fit: ")
