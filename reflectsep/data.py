@@ -208,6 +208,10 @@ class Fit:
     a: Float[Tensor, "3"]
     n_s: Float[Tensor, ""]
     n_d: Float[Tensor, ""]
+    softness: Float[Tensor, ""]
+    """Width of the shadow's edge over the mean scattering root; 0: hard, the paper's formula."""
+    haze: Float[Tensor, ""]
+    """Height of the lobe's haze; 0: the paper's single power."""
     global_names: tuple[str, ...]
     """Order of `covariance`: the globals that were free."""
     covariance: Float[Tensor, "globals globals"]
@@ -218,7 +222,9 @@ class Fit:
     d_sd: Float[Tensor, "3 channels height width"]
     B_sd: Float[Tensor, "channels height width"]
     residual: Float[Tensor, "lights channels height width"]
-    """Picture minus model."""
+    """Picture minus model, in the capture's units."""
+    intensity: Float[Tensor, "lights"]
+    """Of every light; d, s and B are for lights of unit intensity, a component is intensity times its power."""
     flags: Int[Tensor, "height width"]
     noise: float
     """Standard deviation of one residual, in the capture's units."""

@@ -216,11 +216,11 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
     def residual(local: Tensor, shared: Tensor, *data: Tensor) -> Tensor:
         return pixel_residual(local, shared, *regroup(data, obs, priors))
 
-    prior_rows = 1 + 3 * obs.channels + 1
+    prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1
     threshold = None
     if robust is not None:
         picture = obs.images.new_full((obs.images[0].numel(),), robust)
-        threshold = torch.cat([picture, picture.new_full((prior_rows + 3 * obs.channels,), torch.inf)])
+        threshold = torch.cat([picture, picture.new_full((prior_rows,), torch.inf)])
     return BlockProblem(
         residual=residual,
         data=(

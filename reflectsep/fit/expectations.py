@@ -1,0 +1,105 @@
+"""Priors whose strength comes from the data: noise, and the scatter of what should be constant.
+
+Noise goes into the split of a pixel, not into its residual, so something must be expected of the split. What holds
+for surfaces in general enters as rows of `fit/problem.py`; how firmly it holds on this object is measured here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.fit.neighbours import MAD_TO_SD, smooth
+from reflectsep.fit.problem import LOG_C_2, Observations, Priors, log_shape, no_priors, unpack
+
+SHAPE_SD = 0.1
+"""Scatter of log B about its geometric value before anything is known of it; 0.2 where the lights are unknown."""
+SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.02, 0.015, 0.01
+"""No prior is taken to be firmer than this: what lies below is the accuracy of the model itself."""
+PARALLEL_SD_MOST = 0.06
+"""Beyond this scatter the direction of s says nothing of that of d."""
+RATIO_SIGMA_PX = 3.0
+VISIBLE = 3.0
+"""A lobe counts as seen where it exceeds this many standard deviations of the noise."""
+
+
+def noise_level(
+    images: Float[Tensor, "pixels channels lights"],
+    residual: Float[Tensor, "pixels channels lights"],
+    unknowns: int,
+) -> float:
+    """Standard deviation of a picture's value, from what a fit of `unknowns` a pixel and channel leaves.
+
+    The median over pixels, so that highlights and shadows have no say; never below 0.03 % of the peak.
+    """
+    lights = images.shape[-1]
+    freedom = max(lights - unknowns, 1) / lights
+    rms = residual.square().mean((1, 2)).sqrt()
+    peak = float(torch.quantile(images.amax((1, 2))[:: max(1, len(images) // 100_000)], 0.999))
+    return max(float(rms.median()) / freedom**0.5, 3e-4 * peak)
+
+
+def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float) -> Priors:
+    """What can be expected before any lobe is fitted."""
+    above = (obs.images - (body @ obs.alpha.mT).clamp_min(0.0)).mean(1).amax(-1)
+    highest = float(torch.quantile(above[:: max(1, len(above) // 100_000)], 0.999))
+    priors = replace(
+        no_priors(len(obs), obs.images),
+        shape=1.0 / (SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD),
+        height=max(highest, 5.0 * sigma),
+    )
+    power = obs.s_basis.square().sum((1, 2))
+    if not bool((power > 0).any()):
+        return priors
+    return replace(priors, parallel=parallel_weight(obs, body, sigma))
+
+
+def parallel_weight(
+    obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float
+) -> Float[Tensor, "pixels"]:
+    """Weight of `d + s parallel to s`: from how parallel the robust body already is; 0 where it is not."""
+    s = obs.s_basis
+    size = s.square().sum(-1, keepdim=True).sqrt()
+    along = (body * s).sum(-1, keepdim=True) / size.square().clamp_min(1e-12)
+    off = (body - along * s).square().sum(-1).sqrt().mean(-1)
+    size = size[..., 0].mean(-1)
+    lit = size > 0.1 * size.max()
+    spread = float((off[lit] / size[lit]).median()) / 1.18  # median of a Rayleigh variable in standard deviations
+    if spread > PARALLEL_SD_MOST:
+        return torch.zeros_like(size)
+    return 1.0 / (max(spread, PARALLEL_SD_LEAST) * size + 0.1 * sigma)
+
+
+def with_ratio(
+    priors: Priors, obs: Observations, whole: Float[Tensor, "pixels channels 3"], mask: Bool[Tensor, "height width"]
+) -> Priors:
+    """`priors` with the ratio row from the present whole diffuse root and its neighbourhood."""
+    s = obs.s_basis
+    power = s.square().sum(-1).mean(-1)
+    ratio = ((whole * s).sum(-1) / s.square().sum(-1).clamp_min(1e-9)).mean(-1)
+    calm = smooth(ratio[:, None], power, mask, RATIO_SIGMA_PX)[:, 0]
+    bright = power > 0.01 * power.max()
+    if not bool(bright.any()):
+        return priors
+    spread = MAD_TO_SD * float((ratio - calm)[bright].abs().median())
+    weight = torch.where(bright, 1.0 / max(spread, RATIO_SD_LEAST), 0.0)
+    return replace(priors, ratio=calm, ratio_weight=weight.to(ratio.dtype))
+
+
+def shape_spread(
+    obs: Observations, local: Tensor, shared: Tensor, shine: Float[Tensor, "pixels lights"], sigma: float
+) -> float:
+    """Scatter of log B about its geometric value over the pixels whose lobe is well seen."""
+    x = unpack(local, obs.channels)
+    row = x.log_B + log_shape(x.d.mean(-2), obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
+    # Well seen: in two pictures or more, and well above the noise.
+    seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
+    first = SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD
+    if int(seen.sum()) < 30:
+        return first
+    values = row[seen]
+    spread = MAD_TO_SD * float((values - values.median()).abs().median())
+    return min(max(spread, SHAPE_SD_LEAST), first)

@@ -1,0 +1,34 @@
+"""How the reflectance problem is to be solved."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """Choices of a fit; the defaults are the method at its best, the alternatives the paper's own and the baseline's."""
+
+    method: Literal["joint", "two_step"] = "joint"
+    """All parameters together, or globals on chosen pixels first and then every pixel on its own (paper, section 5)."""
+    scattering: Literal["measured", "none", "unknown"] = "measured"
+    """s from the sweeps; left out (Lin & Lee); or fitted, seven unknowns a pixel (n >= 8)."""
+    n_s: float | None = None
+    """Fixed exponent of the lobe; None: fitted."""
+    refine_n_d: bool = False
+    """Fit n_d as a fifth global, from where the sweeps put it."""
+    weights: Literal["paper", "noise"] = "paper"
+    """lambda of Eq. 22, or one weight for all pictures."""
+    lambda_basis: float = 1.0
+    lambda_other: float = 2.0
+    robust: Literal["huber", "none"] = "huber"
+    """Loss of the pictures' residuals."""
+    lobe: Literal["auto", "single"] = "auto"
+    """Add a haze and a soft shadow edge where the pictures ask for them, or hold to the paper's formula."""
+    prior: Literal["auto", "none"] = "auto"
+    """Priors of a strength taken from the data, or none but a bound on the lobe."""
+    max_iterations: int = 20
+    """Limit of every joint solve."""
+    tolerance: float = 1e-6
+    globals_pixels: int = 300
+    chunk: int = 1 << 15
+    dtype: Literal["float32", "float64"] = "float64"

@@ -1,0 +1,156 @@
+"""What a finished fit says: parameters as pictures, their certainty, and flags."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from reflectsep.data import Fit, PhotometricStack, Scattering
+from reflectsep.fit.options import FitOptions
+from reflectsep.fit.problem import (
+    SHARED_NAMES,
+    build_problem,
+    pixel_residual,
+    unpack,
+    unpack_globals,
+)
+from reflectsep.fit.solution import lobe_pictures
+from reflectsep.fit.state import State
+from reflectsep.flags import Flag, mark
+from reflectsep.solve.joint import inverse, reduced_system
+from reflectsep.solve.local import normal_equations
+from reflectsep.solve.problem import robust_weight
+
+AMBIGUOUS_COST = 2.0
+"""Two solutions whose costs differ by less are not told apart by the pictures."""
+OUTLIER = 5.0
+"""Residual, in standard deviations, that marks a pixel."""
+
+
+def describe(
+    state: State,
+    stack: PhotometricStack,
+    scattering: Scattering | None,
+    intensity: Float[Tensor, "lights"],
+    options: FitOptions,
+) -> Fit:
+    """The finished fit as pictures in single precision; zero outside the mask."""
+    obs, mask, shared = state.obs, state.mask, state.shared
+    x, g = unpack(state.found.local, obs.channels), unpack_globals(shared, obs.n_d)
+    covariance = shared_covariance(state)
+    local_sd = local_deviation(state, covariance)
+    sd = unpack(local_sd, obs.channels)
+    misfit = picture_residual(state)
+    B, B_sd = x.B, x.B * sd.log_B
+    picture = lambda values: to_picture(values, mask)  # noqa: E731
+    s = obs.s if x.s is None else x.s @ obs.alpha.mT
+    return Fit(
+        a=g.a.float(),
+        n_s=g.n_s.float(),
+        n_d=torch.as_tensor(g.n_d).float(),
+        softness=g.softness.abs().float(),
+        haze=g.haze.float(),
+        global_names=tuple(n for n, free in zip(SHARED_NAMES, state.free.tolist(), strict=True) if free),
+        covariance=covariance[state.free][:, state.free],
+        d=picture(x.d),
+        s=picture(s),
+        B=picture(B[:, None, None].expand(-1, obs.channels, 1))[0],
+        d_sd=picture(sd.d),
+        B_sd=picture(B_sd[:, None, None].expand(-1, obs.channels, 1))[0],
+        residual=picture(-misfit * intensity),
+        intensity=intensity.float(),
+        flags=final_flags(state, stack, scattering, misfit),
+        noise=state.sigma,
+        cost=float(state.found.cost.sum()),
+        iterations=state.joint.iterations if state.joint is not None else 0,
+        history=tuple({"cost": c} for c in (state.joint.history if state.joint is not None else ())),
+        warnings=warnings(state, options),
+    )
+
+
+def to_picture(values: Float[Tensor, "pixels channels maps"], mask: Tensor) -> Float[Tensor, "maps channels h w"]:
+    """Values of the fitted pixels as pictures, float32."""
+    picture = values.new_zeros(values.shape[2], values.shape[1], *mask.shape, dtype=torch.float32)
+    picture[..., mask] = values.permute(2, 1, 0).float()
+    return picture
+
+
+def picture_residual(state: State) -> Float[Tensor, "pixels channels lights"]:
+    """Model minus picture of every value, lights of unit intensity."""
+    rows = pixel_residual(state.found.local, state.shared, state.obs, state.priors)
+    count = state.obs.images[0].numel()
+    return rows[:, :count].view_as(state.obs.images) / state.obs.weight
+
+
+def shared_covariance(state: State) -> Float[Tensor, "8 8"]:
+    """Inverse of the reduced system over the free globals, zero elsewhere."""
+    problem = build_problem(state.obs, state.priors, robust=state.robust)
+    S = reduced_system(problem, state.found.local, state.shared, state.effort.chunk).S
+    covariance = torch.zeros_like(S)
+    index = state.free.nonzero()[:, 0]
+    covariance[index[:, None], index] = torch.linalg.pinv(S[index][:, index], hermitian=True)
+    return covariance
+
+
+def local_deviation(state: State, covariance: Float[Tensor, "8 8"]) -> Float[Tensor, "pixels P"]:
+    """Standard deviation of every local unknown, that of the globals carried along.
+
+    cov(l) = V^-1 + V^-1 W cov(g) W^T V^-1
+    """
+    parts = []
+    for start in range(0, len(state.obs), state.effort.chunk):
+        index = torch.arange(start, min(start + state.effort.chunk, len(state.obs)))
+        problem = build_problem(state.obs.take(index), state.priors.take(index), robust=state.robust)
+        r, J, K = problem.linearise(state.found.local[index], state.shared)
+        weight = robust_weight(r, problem.threshold)
+        V, _ = normal_equations(r, J, weight)
+        V_inv = inverse(V)
+        pull = V_inv @ (J.mT @ (K * weight[..., None]))
+        variance = V_inv.diagonal(dim1=-2, dim2=-1) + torch.einsum("npg,gh,nph->np", pull, covariance, pull)
+        parts.append(variance.clamp_min(0.0).sqrt())
+    return torch.cat(parts)
+
+
+def final_flags(
+    state: State,
+    stack: PhotometricStack,
+    scattering: Scattering | None,
+    misfit: Float[Tensor, "pixels channels lights"],
+) -> Int[Tensor, "height width"]:
+    """Flags of the stack and of the scattering, and what the fit itself noticed."""
+    obs, found = state.obs, state.found
+    flags = stack.flags if scattering is None else stack.flags | scattering.flags
+    x = unpack(found.local, obs.channels)
+    shine = lobe_pictures(obs, found.local, state.shared).amax(-1)
+    unlike = torch.where(obs.clipped, misfit.clamp_max(0.0), misfit).abs().amax((1, 2)) > OUTLIER * state.sigma
+    marks = {
+        Flag.FAINT_LOBE: shine < 3.0 * state.sigma,
+        Flag.NOT_CONVERGED: ~found.converged,
+        Flag.AMBIGUOUS: found.runner_up < found.cost + AMBIGUOUS_COST,
+        Flag.ATTACHED_SHADOW: (x.d.mean(1) < 0).any(-1),
+        Flag.SHADOW_OR_OUTLIER: unlike,
+        Flag.UNDEREXPOSED: obs.images[..., :3].amax((1, 2)) < 3.0 * state.sigma,
+    }
+    for flag, where in marks.items():
+        picture = torch.zeros_like(state.mask)
+        picture[state.mask] = where
+        flags = mark(flags, picture, flag)
+    return mark(flags, ~stack.mask, Flag.OUTSIDE_MASK)
+
+
+def warnings(state: State, options: FitOptions) -> tuple[str, ...]:
+    """What a person should know before trusting the numbers."""
+    said = []
+    shine = lobe_pictures(state.obs, state.found.local, state.shared)
+    seen = int(((shine > 3.0 * state.sigma).sum(-1) >= 2).sum())
+    if seen < 30:
+        said.append(
+            f"only {seen} pixels show the highlight in two or more pictures: n_s, a and B rest on the prior; "
+            "the specular component is not to be trusted"
+        )
+    if state.joint is not None and not state.joint.converged:
+        said.append(f"the joint fit stopped at its limit of {options.max_iterations} iterations")
+    if not state.obs.lights_known:
+        said.append("light directions are unknown: no bound on the lobe's direction, and no relighting by direction")
+    return tuple(said)

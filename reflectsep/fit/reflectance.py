@@ -1,0 +1,295 @@
+"""The fit of a capture: pictures and scattering in, parameters of every pixel with their certainty out.
+
+    robust body -> grid and joint fit of the globals on telling pixels -> search over B of every pixel
+    -> lobes handed on between neighbours -> everything jointly -> haze, soft shadows and neighbourhood, jointly again
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.data import Fit, PhotometricStack, Scattering
+from reflectsep.errors import FitError
+from reflectsep.fit.body import extend_into_shadow, robust_body
+from reflectsep.fit.expectations import first_priors, noise_level, shape_spread, with_ratio
+from reflectsep.fit.options import FitOptions
+from reflectsep.fit.outcome import describe, picture_residual
+from reflectsep.fit.problem import (
+    ROOT_HAZE,
+    SOFTNESS,
+    Observations,
+    build_problem,
+    no_priors,
+    unpack,
+)
+from reflectsep.fit.search import informative_pixels
+from reflectsep.fit.solution import (
+    Effort,
+    LocalFit,
+    fit_everything,
+    fit_globals,
+    fit_locals,
+    hand_on_lobes,
+    initial_shared,
+    lobe_pictures,
+)
+from reflectsep.fit.state import State
+from reflectsep.flags import Flag
+from reflectsep.model import diffuse
+from reflectsep.progress import Progress, silent
+from reflectsep.solve.joint import JointOptions
+from reflectsep.solve.local import Termination
+
+HUBER = 5.0
+"""Residuals beyond this many standard deviations are cast shadows or inter-reflections, not noise."""
+MIN_PICTURES = {"measured": 6, "none": 6, "unknown": 8}
+EXTENSION_GAIN = 0.01
+"""Haze and soft shadows stay only where they lower the whole cost by this share."""
+
+
+def fit_reflectance(
+    stack: PhotometricStack,
+    scattering: Scattering | None,
+    options: FitOptions = FitOptions(),
+    *,
+    progress: Progress = silent,
+) -> Fit:
+    """Fit {a, n_s} and {B, D_1, D_2, D_3}(x) of Eqs. 20 and 21 to the pictures (paper, section 5).
+
+    Args:
+        stack: linear pictures (lights, channels, height, width), six or more (eight with unknown scattering).
+        scattering: s of every light; None or `options.scattering == "none"`: s = 0, the model of Lin & Lee.
+        options: see `FitOptions`.
+        progress: called as (stage, done, total).
+
+    Raises:
+        FitError: too few pictures, no usable pixel, or pictures without contrast.
+    """
+    dtype = torch.float64 if options.dtype == "float64" else torch.float32
+    obs, mask, intensity = observe(stack, scattering, options, dtype)
+    state = prepare(obs, mask, options)
+    state = start(state, options, progress)
+    if options.method == "joint":
+        state = refine(state, options, progress)
+    return describe(state, stack, scattering, intensity, options)
+
+
+def observe(
+    stack: PhotometricStack, scattering: Scattering | None, options: FitOptions, dtype: torch.dtype
+) -> tuple[Observations, Bool[Tensor, "height width"], Float[Tensor, "lights"]]:
+    """Flatten the pixels that can be fitted, for lights of unit intensity; weights are filled in by `prepare`."""
+    lights = len(stack.names)
+    if lights < MIN_PICTURES[options.scattering]:
+        raise FitError(
+            f"{lights} pictures: the fit with {options.scattering} scattering needs at least "
+            f"{MIN_PICTURES[options.scattering]}"
+        )
+    mask = stack.mask & ((stack.flags & int(Flag.INVALID_INPUT)) == 0)
+    if not bool(mask.any()):
+        raise FitError("no pixel to fit: the mask is empty or every pixel has invalid values")
+    known = stack.light_vectors is not None
+    vectors = stack.light_vectors.to(dtype) if stack.light_vectors is not None else torch.eye(3, dtype=dtype)
+    intensity = vectors.norm(dim=-1) if known else torch.ones(lights, dtype=dtype)
+    view = stack.view.to(dtype)
+    basis = vectors[:3] / vectors[:3].norm(dim=-1, keepdim=True)
+    alpha = stack.alpha.to(dtype)
+    if known:
+        alpha = (vectors / intensity[:, None]) @ torch.linalg.inv(basis)
+    images = stack.images.to(dtype)[..., mask].permute(2, 1, 0) / intensity
+    if not bool((images.amax() - images.amin()) > 0):
+        raise FitError("the pictures have no contrast inside the mask")
+    use = scattering is not None and options.scattering != "none"
+    n_d = scattering.n_d if use and scattering is not None else 1.0
+    s = torch.zeros_like(images)
+    if use and scattering is not None:
+        s = scattering.root.to(dtype)[..., mask].permute(2, 1, 0) / intensity ** (1.0 / n_d)
+    obs = Observations(
+        images=images.contiguous(),
+        s=s.contiguous(),
+        weight=torch.ones_like(images),
+        clipped=stack.saturated[..., mask].permute(2, 1, 0).contiguous(),
+        alpha=alpha,
+        normal_map=torch.linalg.inv(basis),
+        view=view,
+        cosine=basis @ view if known else torch.ones(3, dtype=dtype),
+        lights_known=known,
+        n_d=None if options.refine_n_d else n_d,
+        s_unknown=options.scattering == "unknown",
+    )
+    return obs, mask, intensity
+
+
+def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitOptions) -> State:
+    """Noise, robust body, scattering beyond the shadow's edge, first priors."""
+    n_d = 1.0 if obs.n_d is None else obs.n_d
+    scale = float(torch.quantile(obs.images.amax((1, 2))[:: max(1, len(obs) // 100_000)], 0.999))
+    if not scale > 0:
+        raise FitError(f"the brightest picture values inside the mask are {scale:.3g}: nothing to fit")
+    body = robust_body(obs.images, torch.full_like(obs.images, 100.0 / scale), obs.alpha, n_d)
+    flat = obs.images.new_zeros(())
+    sigma = noise_level(obs.images, obs.images - diffuse(body @ obs.alpha.mT, flat, n_d), 3)
+    body = robust_body(obs.images, torch.full_like(obs.images, 1.0 / sigma), obs.alpha, n_d)
+    measured = obs.s.clone()
+    extended = extend_into_shadow(obs.s_basis, body) if bool((obs.s != 0).any()) else obs.s_basis
+    mixed = extended @ obs.alpha.mT
+    linear = obs.s_basis @ obs.alpha.mT
+    # Lights with a sweep of their own keep what was measured, moved with the extension beyond the shadow's edge.
+    own = (measured - linear).abs().amax((0, 1)) > 1e-9
+    s = torch.where(own, measured.minimum(measured + mixed - linear), mixed)
+    s[..., :3] = extended
+    obs = replace(obs, s=s, weight=weights(obs, options, sigma))
+    priors = first_priors(obs, body, sigma)
+    if options.prior == "none":
+        priors = replace(no_priors(len(obs), obs.images), height=priors.height)
+    if obs.s_unknown:
+        priors = replace(priors, parallel=torch.zeros_like(priors.parallel))
+        priors = replace(priors, ratio_weight=torch.zeros_like(priors.ratio_weight))
+    shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)
+    free = torch.tensor([True, True, True, options.n_s is None, True, False, False, options.refine_n_d])
+    polish = Termination(tolerance=options.tolerance * 1e-2, max_iterations=60)
+    effort = Effort(
+        polish=polish,
+        joint=JointOptions(max_iterations=options.max_iterations, tolerance=options.tolerance, chunk=options.chunk),
+        chunk=options.chunk,
+    )
+    nothing = LocalFit(obs.images[:, 0, :1], obs.images[:, 0, 0], obs.images[:, 0, 0], obs.clipped[:, 0, 0])
+    return State(
+        obs=obs,
+        priors=priors,
+        mask=mask,
+        effort=effort,
+        robust=HUBER if options.robust == "huber" else None,
+        sigma=sigma,
+        shared=shared,
+        free=free,
+        found=nothing,
+    )
+
+
+def weights(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels channels lights"]:
+    """sqrt(lambda_j) / sigma of every value (Eq. 22)."""
+    factor = torch.full((obs.images.shape[-1],), options.lambda_other, dtype=obs.images.dtype)
+    factor[:3] = options.lambda_basis
+    if options.weights == "noise":
+        factor = torch.ones_like(factor)
+    return (factor.sqrt() / sigma).expand_as(obs.images).contiguous()
+
+
+def start(state: State, options: FitOptions, progress: Progress) -> State:
+    """Globals on telling pixels, then every pixel (the paper's two steps), then the noise and the shape's scatter."""
+    obs, effort = state.obs, state.effort
+    n_d = 1.0 if obs.n_d is None else obs.n_d
+    body = robust_body(obs.images, torch.full_like(obs.images, 1.0 / state.sigma), obs.alpha, n_d)
+    index = informative_pixels(obs, body, options.globals_pixels)
+
+    def globals_from(state: State) -> Tensor:
+        part = state.obs.take(index), state.priors.take(index)
+        report = lambda done, total: progress("globals", done, total)  # noqa: E731
+        return fit_globals(*part, state.shared, state.free, effort, state.robust, report)
+
+    state = replace(state, shared=globals_from(state))
+    if options.prior == "auto":
+        part, priors = state.obs.take(index), state.priors.take(index)
+        found = fit_locals(part, priors, state.shared, effort, state.robust)
+        good = (found.cost <= found.cost.quantile(effort.trim)).nonzero()[:, 0]
+        shine = lobe_pictures(part, found.local, state.shared)[good]
+        spread = shape_spread(part.take(good), found.local[good], state.shared, shine, state.sigma)
+        state = replace(state, priors=replace(state.priors, shape=1.0 / spread))
+        state = replace(state, shared=globals_from(state))
+    progress("pixels", 0, 3)
+    found = fit_locals(obs, state.priors, state.shared, effort, state.robust)
+    for i, radius in enumerate((2, 1)):
+        progress("pixels", i + 1, 3)
+        found = hand_on_lobes(
+            obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius
+        )
+    progress("pixels", 3, 3)
+    return with_noise_of_fit(replace(state, found=found), options)
+
+
+def with_noise_of_fit(state: State, options: FitOptions) -> State:
+    """The noise as the fit itself leaves it: the first figure, from before any lobe was known, is too large."""
+    misfit = picture_residual(state)
+    sigma = noise_level(state.obs.images, misfit, 4)
+    obs = replace(state.obs, weight=weights(state.obs, options, sigma))
+    return rescored(replace(state, obs=obs, sigma=sigma))
+
+
+def refine(state: State, options: FitOptions, progress: Progress) -> State:
+    """Everything jointly; then haze and soft shadows where they pay; then the neighbourhood's say."""
+    state = joint_step(state, "joint fit", progress)
+    if options.lobe == "auto":
+        state = try_extensions(state, progress)
+    if bool((state.priors.parallel > 0).any()):
+        for i in range(2):
+            x = unpack(state.found.local, state.obs.channels)
+            whole = x.d + (state.obs.s_basis if x.s is None else x.s)
+            priors = with_ratio(state.priors, state.obs, whole, state.mask)
+            state = rescored(replace(state, priors=priors))
+            state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1}", progress)
+    return rescored(hand_on(state, 1))
+
+
+def joint_step(state: State, stage: str, progress: Progress) -> State:
+    """One joint solve of globals and all pixels."""
+    total = state.effort.joint.max_iterations
+    joint = fit_everything(
+        state.obs,
+        state.priors,
+        state.found,
+        state.shared,
+        state.free,
+        state.effort,
+        state.robust,
+        lambda done, limit: progress(stage, done, limit),
+    )
+    progress(stage, total, total)
+    found = replace_local(state.found, joint.local)
+    return rescored(replace(state, shared=joint.shared, joint=joint, found=found))
+
+
+def replace_local(found: LocalFit, local: Tensor) -> LocalFit:
+    """`found` at other local parameters."""
+    return LocalFit(local, found.cost, found.runner_up, found.converged)
+
+
+def rescored(state: State) -> State:
+    """Costs at the present parameters and priors."""
+    problem = build_problem(state.obs, state.priors, robust=state.robust)
+    cost = problem.costs(state.found.local, state.shared)
+    shift = cost - state.found.cost
+    found = LocalFit(state.found.local, cost, state.found.runner_up + shift.nan_to_num(0.0), state.found.converged)
+    return replace(state, found=found)
+
+
+def hand_on(state: State, radius: int) -> State:
+    """`hand_on_lobes` on the state."""
+    found = hand_on_lobes(
+        state.obs,
+        state.priors,
+        state.found,
+        state.shared,
+        state.mask,
+        state.effort,
+        state.robust,
+        radius=radius,
+    )
+    return replace(state, found=found)
+
+
+def try_extensions(state: State, progress: Progress) -> State:
+    """Free haze and soft shadows; keep them only if the whole cost falls by more than `EXTENSION_GAIN`."""
+    before = float(state.found.cost.sum())
+    shared, free = state.shared.clone(), state.free.clone()
+    shared[ROOT_HAZE], free[ROOT_HAZE] = 0.2, True
+    if bool((state.obs.s != 0).any()):
+        shared[SOFTNESS], free[SOFTNESS] = 0.12, True
+    trial = joint_step(rescored(replace(state, shared=shared, free=free)), "haze and shadow edges", progress)
+    after = float(trial.found.cost.sum())
+    kept = math.isfinite(after) and after < before * (1.0 - EXTENSION_GAIN)
+    return trial if kept else state

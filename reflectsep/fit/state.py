@@ -1,0 +1,28 @@
+"""The value that the steps of a fit hand on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.fit.problem import Observations, Priors
+from reflectsep.fit.solution import Effort, LocalFit
+from reflectsep.solve.joint import JointSolution
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """A fit under way."""
+
+    obs: Observations
+    priors: Priors
+    mask: Bool[Tensor, "height width"]
+    effort: Effort
+    robust: float | None
+    sigma: float
+    shared: Float[Tensor, "8"]
+    free: Bool[Tensor, "8"]
+    found: LocalFit
+    joint: JointSolution | None = None
