@@ -191,6 +191,8 @@ class Scattering:
 
     root: Float[Tensor, "lights channels height width"]
     """s = I_scat^(1/n_d) of every light of the stack: measured where it has a sweep, mixed by alpha where not."""
+    root_sd: Float[Tensor, "lights channels height width"] | None = None
+    """Standard deviation of `root` by the noise of the frames."""
     measured: tuple[bool, ...]
     """Per light: has a sweep of its own."""
     n_d: float

@@ -1,17 +1,13 @@
 """Pictures under lights never taken: from light vectors to alpha (Eq. 15), and from alpha to a folder of EXRs.
 
 There is no model in here; whatever can be relit is asked for the pictures.
-
-**Intensity.** Light adds in radiance: a lamp twice as bright makes every pixel twice as bright, highlights too. Alpha
-does not do that: scaled by g, it scales the diffuse part by g^n_d and the lobe by g^n_s (Eq. 21). So a light to relight
-with is a direction at the brightness of the basis lights, which gives its alpha, and a gain on the picture.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -25,19 +21,17 @@ from reflectsep.data import Light, Vector
 from reflectsep.errors import LightError
 from reflectsep.io.exr import write_channels
 from reflectsep.io.files import atomic_folder, write_json
+from reflectsep.progress import Progress, silent
 
 MARKER = "relit.json"
-"""In every folder of relit pictures: the alpha and gain of each, and the sign that the folder may be replaced."""
-
-Progress = Callable[[int, int], None]
-"""Called with (pictures done, pictures in all)."""
+"""In every folder of relit pictures: the alpha of each, and the sign that the folder may be replaced."""
 
 
 class Relightable(Protocol):
     """What can be relit; a separation, in short."""
 
     def relight(self, alpha: Tensor, /) -> Tensor:
-        """Pictures (..., channels, height, width) for alpha (..., 3)."""
+        """Pictures (..., channels, height, width) for alpha (..., 3), intensity included."""
         ...
 
 
@@ -46,9 +40,9 @@ class LightMix:
     """A light to relight with."""
 
     alpha: Vector
-    """Mix of the basis lights at their brightness (Eq. 15)."""
-    gain: tuple[float, ...] = (1.0,)
-    """Factor on the picture, one for all or one a channel."""
+    """Mix of the basis lights (Eq. 15), intensity included."""
+    colour: tuple[float, ...] | None = None
+    """Factor on each channel of the picture, for a coloured light; None for a white one."""
 
 
 def alphas_for(lights: Sequence[Light], basis: Float[Tensor, "lights 3"] | None) -> dict[str, LightMix]:
@@ -67,8 +61,8 @@ def alphas_for(lights: Sequence[Light], basis: Float[Tensor, "lights 3"] | None)
             "the result's basis lights have no directions, so a direction means nothing: give alpha instead"
         )
     vectors = basis[:3].detach().double().cpu()
-    brightness = float(vectors.norm(dim=1).log().mean().exp())
-    if not math.isfinite(brightness) or float(torch.linalg.svdvals(vectors)[2]) <= 1e-6 * brightness:
+    sizes = torch.linalg.svdvals(vectors) if bool(torch.isfinite(vectors).all()) else torch.zeros(3)
+    if float(sizes[2]) <= 1e-6 * float(sizes[0]):
         raise LightError("the result's basis lights are coplanar; expected three directions that span space")
     if not lights:
         raise LightError("no lights to relight with; expected at least one")
@@ -77,10 +71,12 @@ def alphas_for(lights: Sequence[Light], basis: Float[Tensor, "lights 3"] | None)
         name = safe_name(light.name)
         if name.lower() in {taken.lower() for taken in mixes}:
             raise LightError(f"light {name}: the name appears twice (case aside); every light needs a file of its own")
-        unit = _unit(light)
-        alpha = torch.linalg.solve(vectors.mT, brightness * unit)
-        gain = tuple(value / brightness for value in _intensity(light))
-        mixes[name] = LightMix(alpha=(float(alpha[0]), float(alpha[1]), float(alpha[2])), gain=gain)
+        intensity = _intensity(light)
+        white = len(intensity) == 1
+        alpha = torch.linalg.solve(vectors.mT, _unit(light) * (intensity[0] if white else 1.0))
+        mixes[name] = LightMix(
+            alpha=(float(alpha[0]), float(alpha[1]), float(alpha[2])), colour=None if white else intensity
+        )
     return mixes
 
 
@@ -94,11 +90,11 @@ def orbit(count: int, elevation_deg: float, *, start_deg: float = 0.0, intensity
         intensity: of each, in the unit of the basis lights'.
 
     Raises:
-        LightError: no lights, or an elevation outside (0, 90].
+        LightError: no lights, or an elevation outside 0 to 90.
     """
-    if count < 1 or not 0 < elevation_deg <= 90:
+    if count < 1 or not 0 <= elevation_deg <= 90:
         raise LightError(
-            f"orbit of {count} lights at {elevation_deg:g} degrees: expected at least 1, in (0, 90] degrees"
+            f"orbit of {count} lights at {elevation_deg:g} degrees: expected at least 1, in 0 to 90 degrees"
         )
     up, out = math.sin(math.radians(elevation_deg)), math.cos(math.radians(elevation_deg))
     lights = []
@@ -115,7 +111,7 @@ def relight_to_folder(
     out: Path | str,
     *,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     chunk: int = 4,
 ) -> tuple[Path, ...]:
     """Write `NAME.exr` (float32, linear, channels R G B or Y) for every light; all of them, or nothing at all.
@@ -125,7 +121,7 @@ def relight_to_folder(
         lights: by name: a mix, or a bare alpha of three numbers.
         out: folder to make.
         overwrite: replace a folder of relit pictures that is there.
-        progress: told after every picture.
+        progress: told of every picture.
         chunk: pictures relit at a time, which bounds memory.
 
     Returns:
@@ -143,9 +139,8 @@ def relight_to_folder(
     with atomic_folder(out, overwrite) as folder:
         for done, (name, picture) in enumerate(relit_pictures(separation, mixes, chunk=chunk), start=1):
             write_channels(folder / f"{name}.exr", _channels(picture))
-            if progress is not None:
-                progress(done, len(mixes))
-        document = {name: {"alpha": list(mix.alpha), "gain": list(mix.gain)} for name, mix in mixes.items()}
+            progress("relight", done, len(mixes))
+        document = {name: _described(mix) for name, mix in mixes.items()}
         write_json(folder / MARKER, {"format": "reflectsep-relit/1", "lights": document})
     return tuple(Path(out) / f"{name}.exr" for name in mixes)
 
@@ -156,7 +151,7 @@ def relit_pictures(
     """The pictures of `mixes` one after the other, relit `chunk` at a time.
 
     Raises:
-        LightError: a gain with neither one value nor one a channel; a relit picture that is not finite.
+        LightError: a coloured light on a grey result; a relit picture that is not finite.
     """
     names = list(mixes)
     for start in range(0, len(names), chunk):
@@ -164,11 +159,7 @@ def relit_pictures(
         with torch.no_grad():
             pictures = separation.relight(torch.tensor([mixes[name].alpha for name in part], dtype=torch.float32))
         for name, picture in zip(part, pictures, strict=True):
-            gain = torch.tensor(mixes[name].gain, dtype=picture.dtype, device=picture.device)
-            if gain.numel() not in (1, picture.shape[0]):
-                found, channels = gain.numel(), picture.shape[0]
-                raise LightError(f"light {name}: intensity of {found} values for a picture of {channels} channels")
-            lit = picture * gain[:, None, None]
+            lit = _coloured(name, picture, mixes[name].colour)
             if not bool(torch.isfinite(lit).all()):
                 raise LightError(f"light {name}: the relit picture is not finite; its alpha or intensity is too large")
             yield name, lit
@@ -216,9 +207,25 @@ def _as_mix(name: str, value: LightMix | Sequence[float] | Tensor) -> LightMix:
         if len(numbers) != 3:
             raise LightError(f"light {name}: alpha of {len(numbers)} numbers; expected three")
         mix = LightMix(alpha=(numbers[0], numbers[1], numbers[2]))
-    if not all(math.isfinite(number) for number in (*mix.alpha, *mix.gain)):
-        raise LightError(f"light {name}: alpha {list(mix.alpha)}, gain {list(mix.gain)}; expected finite numbers")
+    if not all(math.isfinite(number) for number in (*mix.alpha, *(mix.colour or ()))):
+        raise LightError(f"light {name}: alpha {list(mix.alpha)}, colour {mix.colour}; expected finite numbers")
     return mix
+
+
+def _coloured(name: str, picture: Tensor, colour: tuple[float, ...] | None) -> Tensor:
+    """`picture` under a light of another colour."""
+    if colour is None:
+        return picture
+    if len(colour) != picture.shape[0]:
+        raise LightError(
+            f"light {name}: intensity of {len(colour)} values for a picture of {picture.shape[0]} channels"
+        )
+    return picture * torch.tensor(colour, dtype=picture.dtype, device=picture.device)[:, None, None]
+
+
+def _described(mix: LightMix) -> dict[str, list[float]]:
+    """`mix` for JSON."""
+    return {"alpha": list(mix.alpha)} | ({} if mix.colour is None else {"colour": list(mix.colour)})
 
 
 def _channels(picture: Tensor) -> dict[str, np.ndarray]:

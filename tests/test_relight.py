@@ -33,11 +33,11 @@ class Ramp:
     x=st.floats(-1, 1), y=st.floats(-1, 1), z=st.floats(0.1, 1), scale=st.floats(0.2, 5), intensity=st.floats(0, 100)
 )
 @settings(deadline=None, max_examples=50)
-def test_a_light_is_its_direction_at_the_basis_brightness_times_a_gain(x, y, z, scale, intensity):
+def test_alpha_rebuilds_direction_times_intensity(x, y, z, scale, intensity):
     basis = scale * BASIS
     mix = alphas_for([Light(name="a", direction=(x, y, z), intensity=(intensity,))], basis)["a"]
     vector = torch.tensor([x, y, z]) / math.sqrt(x * x + y * y + z * z)
-    rebuilt = mix.gain[0] * torch.tensor(mix.alpha) @ basis
+    rebuilt = torch.tensor(mix.alpha) @ basis
     torch.testing.assert_close(rebuilt, intensity * vector, rtol=1e-4, atol=1e-4)
 
 
@@ -48,11 +48,13 @@ def test_a_basis_light_is_itself():
     torch.testing.assert_close(torch.tensor([mixes[str(i)].alpha for i in range(3)]), torch.eye(3))
 
 
-def test_brightness_changes_the_gain_and_never_alpha():
-    lights = [Light(name=n, direction=(0.1, 0.2, 0.9), intensity=(v,)) for n, v in (("a", 1.0), ("b", 2.0))]
-    mixes = alphas_for(lights, BASIS)
-    assert mixes["a"].alpha == mixes["b"].alpha
-    assert mixes["b"].gain[0] == pytest.approx(2 * mixes["a"].gain[0])
+def test_a_coloured_light_mixes_as_a_white_one_and_colours_the_picture():
+    white, coloured = (
+        alphas_for([Light(name="a", direction=(0.1, 0.2, 0.9), intensity=i)], BASIS)["a"]
+        for i in ((1.0,), (1.0, 2.0, 3.0))
+    )
+    assert coloured.alpha == white.alpha
+    assert (white.colour, coloured.colour) == (None, (1.0, 2.0, 3.0))
 
 
 def test_orbit_closes_and_stands_at_its_elevation():
@@ -66,7 +68,7 @@ def test_orbit_closes_and_stands_at_its_elevation():
     assert lights[0].intensity == (2.0,)
 
 
-@pytest.mark.parametrize(("count", "elevation"), [(0, 45), (3, 0), (3, -10), (3, 91), (3, math.nan)])
+@pytest.mark.parametrize(("count", "elevation"), [(0, 45), (3, -10), (3, 91), (3, math.nan)])
 def test_impossible_orbit(count, elevation):
     with pytest.raises(LightError, match="orbit"):
         orbit(count, elevation)
@@ -114,18 +116,18 @@ def test_ordinary_names_pass(name):
 @pytest.mark.parametrize(("channels", "names"), [(1, ["Y"]), (3, ["R", "G", "B"])])
 def test_folder_of_pictures(tmp_path, channels, names):
     heard = []
-    lights = {f"L{i}": LightMix(alpha=(float(i), 0.0, 0.0), gain=(0.5,)) for i in range(7)}
+    lights = {f"L{i}": LightMix(alpha=(0.5 * i, 0.0, 0.0)) for i in range(7)}
     subject = Ramp(channels=channels)
     files = relight_to_folder(subject, lights, tmp_path / "out", progress=lambda *a: heard.append(a), chunk=3)
     assert [f.name for f in files] == [f"L{i}.exr" for i in range(7)]
     assert subject.largest_batch == 3
-    assert heard == [(i, 7) for i in range(1, 8)]
+    assert heard == [("relight", i, 7) for i in range(1, 8)]
     found = read_channels(files[5])
     assert sorted(found) == sorted(names)
     for index, name in enumerate(names):
         assert found[name].dtype == "float32"
         assert found[name][1, 2] == pytest.approx(5 * 0.5 * (index + 1) * 6)
-    assert json.loads((tmp_path / "out" / MARKER).read_text())["lights"]["L2"] == {"alpha": [2.0, 0, 0], "gain": [0.5]}
+    assert json.loads((tmp_path / "out" / MARKER).read_text())["lights"]["L2"] == {"alpha": [1.0, 0, 0]}
 
 
 def test_values_are_not_rounded_to_half(tmp_path):
@@ -134,13 +136,13 @@ def test_values_are_not_rounded_to_half(tmp_path):
 
 
 def test_coloured_light_scales_each_channel(tmp_path):
-    (file,) = relight_to_folder(Ramp(), {"a": LightMix(alpha=(1.0, 0, 0), gain=(1.0, 2.0, 3.0))}, tmp_path / "o")
+    (file,) = relight_to_folder(Ramp(), {"a": LightMix(alpha=(1.0, 0, 0), colour=(1.0, 2.0, 3.0))}, tmp_path / "o")
     found = read_channels(file)
     assert [found[c][0, 0] for c in "RGB"] == [1.0, 4.0, 9.0]
 
 
 def test_colour_on_a_grey_result_is_refused_with_nothing_written(tmp_path):
-    lights = {"a": LightMix(alpha=(1.0, 0, 0)), "b": LightMix(alpha=(1.0, 0, 0), gain=(1.0, 2.0, 3.0))}
+    lights = {"a": LightMix(alpha=(1.0, 0, 0)), "b": LightMix(alpha=(1.0, 0, 0), colour=(1.0, 2.0, 3.0))}
     with pytest.raises(LightError, match="3 values for a picture of 1"):
         relight_to_folder(Ramp(channels=1), lights, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -171,7 +173,7 @@ def test_a_foreign_folder_is_never_replaced(tmp_path):
         ({"a": [1.0, 0, math.nan]}, "finite"),
         ({"a/b": [1.0, 0, 0]}, "cannot name a file"),
         ({"a": [1.0, 0, 0], "A": [1.0, 0, 0]}, "share a name"),
-        ({"a": LightMix(alpha=(3e38, 0, 0), gain=(10.0,))}, "not finite"),
+        ({"a": LightMix(alpha=(3e38, 0, 0))}, "not finite"),
     ],
 )
 def test_bad_requests_write_nothing(tmp_path, lights, message):

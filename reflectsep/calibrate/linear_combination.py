@@ -49,6 +49,8 @@ class EstimateSettings:
     tiles: int = 10
     """Tiles along each side of the picture, for the covariance."""
     minimum_pixels: int = 100
+    most_pixels: int = 50_000
+    """Of more values, evenly spread ones are used: they already pin alpha down, and time stays bounded."""
     separation: float = 2.5
     """Least ratio between the weakest signal and the noise that tell alpha apart."""
     largest: float = 30.0
@@ -104,11 +106,12 @@ def estimate_alpha(
             f"{count} pixels are diffuse and lit in all four pictures, expected at least {settings.minimum_pixels}; "
             "give the light's direction, or choose basis lights nearer to it"
         )
-    samples = roots[:, chosen].mT  # (pixels, 4)
+    stride = -(-count // settings.most_pixels)
+    samples = roots[:, chosen][:, ::stride].mT  # (pixels, 4)
     scale = samples.abs().median().clamp_min(1e-300)
     alpha, sigma = _least_median(samples / scale, settings)
     alpha, sigma, weights = _reweighted(samples / scale, alpha, sigma, settings)
-    covariance = _covariance(samples / scale, alpha, sigma, _tiles(chosen, settings.tiles))
+    covariance = _covariance(samples / scale, alpha, sigma, _tiles(chosen, settings.tiles)[::stride])
     return AlphaEstimate(
         alpha=alpha.float(),
         sd=covariance.diagonal().clamp_min(0).sqrt().float(),
@@ -179,9 +182,7 @@ def _reweighted(
         normal = axes[:, 0]
         if float(normal[:3].norm()) > settings.largest * abs(float(normal[3])):
             # The plane that noise alone separates holds no y: the basis pictures depend on one another.
-            raise LightError(
-                f"alpha would be larger than {settings.largest:g}: repeated or coplanar basis lights"
-            )
+            raise LightError(f"alpha would be larger than {settings.largest:g}: repeated or coplanar basis lights")
         update = -normal[:3] / normal[3]
         moved = (update - alpha).norm()
         alpha = update

@@ -22,6 +22,8 @@ SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.02, 0.015, 0.01
 PARALLEL_SD_MOST = 0.06
 """Beyond this scatter the direction of s says nothing of that of d."""
 RATIO_SIGMA_PX = 3.0
+HEIGHT_FACTOR = 2.0
+"""Peak of the lobe that is believed, over the largest value that stands above the robust body (which takes part of it)."""
 VISIBLE = 3.0
 """A lobe counts as seen where it exceeds this many standard deviations of the noise."""
 
@@ -49,7 +51,7 @@ def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], si
     priors = replace(
         no_priors(len(obs), obs.images),
         shape=1.0 / (SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD),
-        height=max(highest, 5.0 * sigma),
+        height=HEIGHT_FACTOR * max(highest, 5.0 * sigma),
     )
     power = obs.s_basis.square().sum((1, 2))
     if not bool((power > 0).any()):

@@ -84,14 +84,15 @@ class Priors:
     ratio_weight: Float[Tensor, "pixels"]
     s_weight: Float[Tensor, "pixels"]
     """1 / standard deviation of the measured s; only where s is a local unknown."""
-    mirror_sd: float = 0.05
+    mirror_sd: float = 0.02
     """Standard deviation of log(C_2 / -2 C_1): 0 for a lobe about the mirror direction."""
-    common_sd: float = 0.03
+    common_sd: float = 0.01
     """Relative standard deviation of a_k / (L_k . V) among the basis lights."""
     height: float = 1.0
-    """Largest specular value seen: the lobe's peak beyond it is penalised."""
-    height_sd: float = 0.5
-    """Standard deviation of the logarithm of that excess."""
+    """Highest peak of the lobe that is not penalised."""
+    height_sd: float = 0.03
+    """Standard deviation of the logarithm of the excess. Rough surfaces are no cosine lobes, and thousands of pixels
+    that agree on a wrong shape outvote any soft bound on it: the three bounds of the lobe are firm."""
     softness_sd: float = 0.3
     haze_sd: float = 0.3
     """Standard deviation of sqrt(haze)."""

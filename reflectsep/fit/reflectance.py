@@ -119,7 +119,7 @@ def observe(
         cosine=basis @ view if known else torch.ones(3, dtype=dtype),
         lights_known=known,
         n_d=None if options.refine_n_d else n_d,
-        s_unknown=options.scattering == "unknown",
+        s_unknown=options.scattering == "unknown" or (use and options.scattering_sd > 0),
     )
     return obs, mask, intensity
 
@@ -146,7 +146,10 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     priors = first_priors(obs, body, sigma)
     if options.prior == "none":
         priors = replace(no_priors(len(obs), obs.images), height=priors.height)
-    if obs.s_unknown:
+    if options.scattering == "measured" and obs.s_unknown:
+        size = obs.s_basis.square().mean((1, 2)).sqrt()
+        priors = replace(priors, s_weight=1.0 / (options.scattering_sd * size + sigma))
+    elif obs.s_unknown:
         priors = replace(priors, parallel=torch.zeros_like(priors.parallel))
         priors = replace(priors, ratio_weight=torch.zeros_like(priors.ratio_weight))
     shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)

@@ -9,7 +9,7 @@ a gain, shared by ours and the baseline's and written under them. All difference
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +64,8 @@ class HeldOut:
     real: Float[Tensor, "channels height width"]
     ours: Float[Tensor, "channels height width"]
     baseline: Float[Tensor, "channels height width"]
+    counts: Bool[Tensor, "height width"] | None = None
+    """Pixels of the object that the numbers are over; leave clipped ones out. All of the object where None."""
 
 
 def write_comparison(
@@ -110,10 +112,15 @@ def comparison_figure(
     if not bool(mask.any()):
         raise ValueError("empty mask; expected at least one pixel of the object")
     mask = mask.cpu()
+    for row in (*rows, *held_out):
+        _check(row, mask)
     crop = _crop(mask)
     white = white_point([*(row.original for row in rows), *(light.real for light in held_out)], mask)
     page = _Page(len(rows) + len(held_out), crop)
-    page.head(title, f"sRGB curve, one exposure: white is {white:.3g} in the capture's units (times the gain, where one is given)")
+    page.head(
+        title,
+        f"sRGB curve, one exposure: white is {white:.3g} in the capture's units (times the gain, where one is given)",
+    )
     gains = _gains(rows, mask, white)
     for index, row in enumerate(rows):
         _draw_components(page, index, row, mask, white, gains, baseline)
@@ -147,7 +154,9 @@ class _Page:
     def row_head(self, row: int, text: str) -> None:
         """Heading of a row, with a rule above."""
         top = self.height - HEAD_IN - row * self.row_h
-        self.figure.text(MARGIN_IN / self.width, (top - 0.13) / self.height, text, fontsize=11, weight="bold", va="center")
+        self.figure.text(
+            MARGIN_IN / self.width, (top - 0.13) / self.height, text, fontsize=11, weight="bold", va="center"
+        )
 
     def axes(self, row: int, column: int, width_in: float | None = None) -> Axes:
         """Empty axes at a place of the grid."""
@@ -202,19 +211,40 @@ def _draw_held_out(
 ) -> None:
     """The row of Figs. 5 and 7, with the scale of the differences at its end."""
     page.row_head(index, f"Held-out light {light.light}")
+    counts = mask if light.counts is None else mask & light.counts.cpu()
     norm = Normalize(-100 * limit / white, 100 * limit / white)
     colours = ScalarMappable(norm=norm, cmap=DIVERGING)
     page.panel(index, 0, tone(light.real, white=white), "(a) real", "")
     for column, name, picture in ((1, "ours", light.ours), (3, baseline, light.baseline)):
-        numbers = f"PSNR {psnr(picture, light.real, mask):.1f} dB\nRMS {100 * relative_rms(picture, light.real, mask):.1f} %"
+        error = 100 * relative_rms(picture, light.real, counts)
+        numbers = f"PSNR {psnr(picture, light.real, counts):.1f} dB\nRMS error {error:.1f} % of real"
         page.panel(index, column, tone(picture, white=white), f"({'abcd'[column]}) synthetic, {name}", numbers)
         difference = torch.where(mask, (light.real - picture).mean(0).cpu(), 0.0) * (100 / white)
         pixels = colours.to_rgba(difference.double().numpy(), bytes=True)[..., :3]
         worst = float(difference.abs().max())
-        page.panel(index, column + 1, pixels, f"({'abcde'[column + 1]}) real − {name}", f"largest {worst:.1f} % of white")
+        page.panel(
+            index, column + 1, pixels, f"({'abcde'[column + 1]}) real − {name}", f"largest {worst:.1f} % of white"
+        )
     bar = page.figure.colorbar(colours, cax=page.axes(index, 5, 0.16), extend="both")
     bar.set_label("real − synthetic, % of white", fontsize=9)
     bar.ax.tick_params(labelsize=9)
+
+
+def _check(row: ComparisonRow | HeldOut, mask: Tensor) -> None:
+    """Refuse pictures of different shapes, and values on the object that are not finite."""
+    shapes = set()
+    for field in fields(row):
+        picture = getattr(row, field.name)
+        if not isinstance(picture, Tensor) or picture.dtype == torch.bool:
+            continue
+        shapes.add(tuple(picture.shape))
+        if picture.shape[-2:] != mask.shape:
+            found, expected = tuple(picture.shape), tuple(mask.shape)
+            raise ValueError(f"light {row.light}: {field.name} of shape {found}, but the mask is {expected}")
+        if not bool(torch.isfinite(picture[..., mask]).all()):
+            raise ValueError(f"light {row.light}: {field.name} has values on the object that are not finite")
+    if len(shapes) != 1:
+        raise ValueError(f"light {row.light}: pictures of shapes {sorted(shapes)}; expected one shape")
 
 
 def _crop(mask: Tensor) -> tuple[slice, slice]:
@@ -248,5 +278,9 @@ def _gains(rows: Sequence[ComparisonRow], mask: Tensor, white: float) -> dict[st
 
 def _difference_limit(held_out: Sequence[HeldOut], mask: Tensor) -> float:
     """Scale of all differences: what 99 % of the values of all of them stay below."""
-    sizes = [(light.real - picture).mean(0, keepdim=True).abs() for light in held_out for picture in (light.ours, light.baseline)]
+    sizes = [
+        (light.real - picture).mean(0, keepdim=True).abs()
+        for light in held_out
+        for picture in (light.ours, light.baseline)
+    ]
     return white_point(sizes, mask, share=0.99) if sizes else 1.0

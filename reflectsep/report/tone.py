@@ -13,9 +13,7 @@ INVALID = (255, 0, 255)
 """Magenta: shown where a value is not a finite number."""
 
 
-def tone(
-    picture: Float[Tensor, "channels height width"], *, white: float = 1.0
-) -> UInt8[np.ndarray, "height width 3"]:
+def tone(picture: Float[Tensor, "channels height width"], *, white: float = 1.0) -> UInt8[np.ndarray, "height width 3"]:
     """The picture as it is shown: divided by `white`, clipped to 0..1, through the sRGB curve.
 
     Args:

@@ -215,6 +215,14 @@ def test_the_same_pictures_give_the_same_alpha_at_any_scale():
     assert scaled.noise == pytest.approx(1000 * first.noise, rel=1e-3)
 
 
+def test_a_share_of_the_pixels_is_enough():
+    images, mask = render(LIGHTS, noise=0.003)
+    whole = estimate_alpha(images[:3], images[4], mask[None])
+    share = estimate_alpha(images[:3], images[4], mask[None], settings=EstimateSettings(most_pixels=500))
+    torch.testing.assert_close(share.alpha, whole.alpha, rtol=0, atol=0.01)
+    assert float(share.sd.norm()) < 10 * float(whole.sd.norm())
+
+
 def test_unusable_values_do_not_count():
     images, mask = render(LIGHTS, noise=0.003)
     expected = estimate_alpha(images[:3], images[4], (mask & (torch.arange(72) < 50))[None]).alpha
@@ -224,9 +232,18 @@ def test_unusable_values_do_not_count():
     )
 
 
+@pytest.mark.parametrize("shade", [0.3, 0.6])
+def test_a_cast_shadow_over_two_fifths_of_the_object_does_not_move_alpha(shade):
+    images, mask = render(LIGHTS, noise=0.003)
+    truth = torch.linalg.solve(torch.tensor(LIGHTS[:3]).mT, torch.tensor(LIGHTS[4])[:, None])[:, 0]
+    columns = mask.sum(0).cumsum(0) < 0.4 * mask.sum()
+    images[4] = torch.where(columns, shade * images[4], images[4])
+    torch.testing.assert_close(estimate_alpha(images[:3], images[4], mask[None]).alpha, truth, rtol=0, atol=0.02)
+
+
 def test_selection_leaves_out_highlights_and_shadows():
     roots = torch.ones(4, 1, 10, 10, dtype=torch.float64) + 0.001 * torch.arange(100.0).reshape(10, 10)
-    roots[1, 0, 2, 2] = 9.0
+    roots[1, 0, 2, 2] = 2.0  # not so bright that the others would count as shadowed
     roots[3, 0, 5, 5] = 0.05
     chosen = select_diffuse(roots, torch.ones(1, 10, 10, dtype=torch.bool), EstimateSettings(faintest=0.0))
     assert not bool(chosen[0, 2, 2])

@@ -1,0 +1,190 @@
+"""A capture's full pictures as a photometric stack: linear, on one scale, bad pixels flagged, alpha of every light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.calibrate.alpha import CONDITION_LIMIT, AlphaReport, light_vector, solve_alpha
+from reflectsep.calibrate.exposure import Response, colour_of, develop, exposure_ratio, response_of
+from reflectsep.calibrate.linear_combination import EstimateSettings
+from reflectsep.data import Capture, PhotometricStack
+from reflectsep.errors import CaptureError, LightError
+from reflectsep.flags import Flag, mark
+from reflectsep.io.stack import RawPictures, read_dark, read_full, read_mask
+from reflectsep.settings import nearest
+
+MINIMUM = 6
+"""Full pictures that the method needs with the scattering known: p >= 4 / (n - 4) pixels carry the rest."""
+
+
+def build_stack(
+    capture: Capture,
+    *,
+    drop: Sequence[str] = (),
+    minimum: int = MINIMUM,
+    settings: EstimateSettings | None = None,
+    condition_limit: float = CONDITION_LIMIT,
+) -> PhotometricStack:
+    """The stack of `calibrate_stack`, without its report."""
+    stack, _ = calibrate_stack(capture, drop=drop, minimum=minimum, settings=settings, condition_limit=condition_limit)
+    return stack
+
+
+def calibrate_stack(
+    capture: Capture,
+    *,
+    drop: Sequence[str] = (),
+    minimum: int = MINIMUM,
+    settings: EstimateSettings | None = None,
+    condition_limit: float = CONDITION_LIMIT,
+) -> tuple[PhotometricStack, AlphaReport]:
+    """Read and develop the full pictures, and find every light's alpha.
+
+    A light's scalar intensity goes into its vector and its alpha; pictures of a light with an intensity a channel are
+    divided by it, and the light counts as one of intensity 1. Where the basis vectors are known, unknown lights get
+    the vector that their alpha implies.
+
+    Args:
+        capture: whose pictures.
+        drop: lights to leave out, e.g. to compare with later; none of the basis.
+        minimum: pictures that there must be.
+        settings: of alpha from the pictures, n_d among them.
+        condition_limit: largest condition number of the basis lights.
+
+    Returns:
+        The stack: a pixel that is not finite somewhere is 0 throughout, flagged and out of the mask. And where the
+        alphas come from and how well vectors and pictures agree.
+
+    Raises:
+        LightError: too few pictures, a wrong name in `drop`, coplanar or repeated basis lights, an alpha that neither
+            vectors nor pictures give.
+        CaptureError: a file that is missing, damaged or of the wrong size, a picture without light or without one
+            finite value on the object.
+    """
+    capture = without(capture, drop)
+    if len(capture.names) < minimum:
+        found = f"{len(capture.names)} full pictures ({', '.join(capture.names)})"
+        raise LightError(f"{capture.folder}: {found}, expected at least {minimum}")
+    raw = read_full(capture)
+    on_object = read_mask(capture)
+    images = develop_pictures(capture, raw, response_of(capture))
+    finite = torch.isfinite(images)
+    _check_pictures(capture, images, finite, on_object)
+    valid = finite.all(1).all(0)
+    mask = on_object & valid
+    if not bool(mask.any()):
+        raise CaptureError(f"{capture.folder}: no pixel of the object is finite in all {len(raw.names)} pictures")
+    images = torch.where(valid, images, 0.0)
+    vectors = [light_vector(capture.lights[name]) for name in raw.names]
+    report = solve_alpha(
+        raw.names, vectors, images, mask & ~raw.saturated, settings=settings, condition_limit=condition_limit
+    )
+    flags = torch.zeros(on_object.shape, dtype=torch.int32)
+    flags = mark(flags, ~on_object, Flag.OUTSIDE_MASK)
+    flags = mark(flags, on_object & ~valid, Flag.INVALID_INPUT)
+    flags = mark(flags, mask & raw.saturated.any(1).any(0), Flag.SATURATED)
+    view = torch.tensor(capture.view, dtype=torch.float32)
+    stack = PhotometricStack(
+        names=raw.names,
+        images=images,
+        saturated=raw.saturated,
+        mask=mask,
+        alpha=report.alpha,
+        light_vectors=report.light_vectors,
+        view=view / view.norm(),
+        flags=flags,
+    )
+    return stack, report
+
+
+def held_out_pictures(
+    capture: Capture, names: Sequence[str]
+) -> tuple[
+    Float[Tensor, "lights channels height width"],
+    Bool[Tensor, "lights channels height width"],
+]:
+    """Pictures of lights that a fit left out, developed as its stack was, and which of their values are clipped.
+
+    Values that are not finite are 0 and count as clipped, so that whoever leaves clipped values out leaves them out.
+
+    Raises:
+        LightError: a name without a full picture, or no name.
+        CaptureError: as `calibrate_stack`.
+    """
+    _check_names(capture, names)
+    if not names:
+        raise LightError(f"{capture.folder}: no held-out lights named; expected at least one")
+    wanted = {*names, capture.basis[0]}  # the first basis picture says which size and channels are expected
+    images = tuple(picture for picture in capture.images if picture.kind == "dark" or picture.light in wanted)
+    first = capture.basis[0]
+    raw = read_full(replace(capture, images=images, basis=(first, first, first)))
+    pictures = develop_pictures(capture, raw, response_of(capture))
+    finite = torch.isfinite(pictures)
+    order = [raw.names.index(name) for name in names]
+    return torch.where(finite, pictures, 0.0)[order], (raw.saturated | ~finite)[order]
+
+
+def without(capture: Capture, drop: Sequence[str]) -> Capture:
+    """`capture` without the full pictures of the lights in `drop`.
+
+    Raises:
+        LightError: a light that has no full picture, or that is of the basis.
+    """
+    _check_names(capture, drop)
+    basis = [name for name in drop if name in capture.basis]
+    if basis:
+        raise LightError(f"{capture.folder}: light {basis[0]} is of the basis and cannot be left out; choose another")
+    images = tuple(picture for picture in capture.images if picture.kind == "dark" or picture.light not in drop)
+    return replace(capture, images=images)
+
+
+def develop_pictures(
+    capture: Capture, raw: RawPictures, response: Response
+) -> Float[Tensor, "lights channels height width"]:
+    """Full pictures in the capture's units, coloured lights' intensity divided out; NaN where they are not finite.
+
+    Raises:
+        CaptureError: an unreadable dark picture, or an intensity that does not fit the channels.
+    """
+    channels = raw.values.shape[1]
+    darks: dict[float | None, Tensor | None] = {}
+    pictures = []
+    for name, values, exposure_s in zip(raw.names, raw.values, raw.exposure_s, strict=True):
+        if exposure_s not in darks:
+            darks[exposure_s] = read_dark(capture, exposure_s)
+        dark = darks[exposure_s]
+        if dark is not None and dark.shape != values.shape:
+            raise CaptureError(
+                f"{capture.folder}: dark picture of {tuple(dark.shape)}, but {capture.full(name).file} is of "
+                f"{tuple(values.shape)} (channels, height, width)"
+            )
+        picture = develop(values, response, dark, exposure_ratio(capture, exposure_s))
+        colour = colour_of(capture.lights[name], channels)
+        pictures.append(picture if colour is None else picture / colour)
+    return torch.stack(pictures)
+
+
+def _check_names(capture: Capture, names: Sequence[str]) -> None:
+    """Refuse names that have no full picture."""
+    for name in names:
+        if name not in capture.names:
+            known = ", ".join(capture.names)
+            raise LightError(
+                f"{capture.folder}: no full picture of light {name}{nearest(name, capture.names)} ({known})"
+            )
+
+
+def _check_pictures(capture: Capture, images: Tensor, finite: Tensor, on_object: Tensor) -> None:
+    """Refuse pictures that say nothing of the object."""
+    for name, picture, good in zip(capture.names, images, finite, strict=True):
+        file = capture.folder / capture.full(name).file
+        seen = good & on_object
+        if not bool(seen.any()):
+            raise CaptureError(f"{file}: not one finite value on the object")
+        if not bool((picture[seen] > 0).any()):
+            raise CaptureError(f"{file}: nothing on the object is brighter than the dark picture; was the light on?")

@@ -1,0 +1,178 @@
+"""The lit band: which frames hold a pixel's own light, and the second pass over a sweep that leaves them out.
+
+Two ways to find it. `profile`: the pixel's lit interval, from its passage (reflectsep/scatter/passage.py) and the
+slab's width, with fractions of a frame and a margin for frames that light it in part. `threshold`: frames near the
+passage that exceed a part of the full picture, both on one scale. A pixel in shadow is never lit and has no hole: all
+of its light came through the body.
+
+The second pass keeps a window of frames around each pixel's passage and the sum of all others, so memory does not grow
+with the number of frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.data import FrameStream
+from reflectsep.progress import Progress
+from reflectsep.scatter.frames import Step, signed_root, steps
+from reflectsep.scatter.passage import Passage
+
+
+SATURATE=.3
+BLUR_PX = 2.0
+"""Along the slab, of the light it brings."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Profiles:
+    """Root frames around each pixel's passage; P pixels of the object."""
+
+    root: Float[Tensor, "frames channels P"]
+    offset: Float[Tensor, "frames P"]
+    """Frame minus passage."""
+    hole: Bool[Tensor, "frames P"]
+    """Not scattering alone, or not received: to be filled."""
+    present: Bool[Tensor, "frames P"]
+    """Received."""
+    saturated: Bool[Tensor, "frames channels P"]
+    light: Float[Tensor, "frames P"]
+    """Light that a frame's slab brings to the object in the pixel's row (column, for a sweep along y), relative to the
+    frames that light the pixel itself."""
+    rest: Float[Tensor, "channels P"]
+    """Sum of the root frames outside the window."""
+
+    def part(self, pixels: slice) -> Profiles:
+        """The same for some of the pixels."""
+        return replace(self, **{k: v[..., pixels] for k, v in vars(self).items()})
+
+    @property
+    def measured(self) -> Float[Tensor, "channels P"]:
+        """Sum of all root frames that need no filling."""
+        return self.rest + (self.root * (self.present & ~self.hole)[:, None]).sum(0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LitBand:
+    """Decides which frames light a pixel."""
+
+    passage: Passage
+    half: float
+    edge: float
+    lit: Bool[Tensor, "height width"]
+    """Pixels that the slab lights at all."""
+    threshold: Float[Tensor, "height width"] | None
+    """Grey value above which a frame near the passage counts as lit; None: the interval in time decides."""
+
+    def hole(self, step: Step) -> Bool[Tensor, "height width"]:
+        """Pixels that this frame lights."""
+        away = (step.index - self.passage.centre).abs()
+        if self.threshold is None or step.lost:
+            return self.lit & (away <= self.half + self.edge)
+        return self.lit & (away <= 2 * self.half + 2) & (step.values.mean(0) > self.threshold)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """A sweep ready for its second pass: what every hole filling works from."""
+
+    stream: FrameStream
+    full: Float[Tensor, "channels height width"]
+    mask: Bool[Tensor, "height width"]
+    band: LitBand
+    n_d: float
+    reach: int
+    clipped_elsewhere: Bool[Tensor, "height width"]
+    """Pixels saturated in a frame that does not light them; written while the frames pass."""
+    progress: Progress
+
+    def walk(self, visit: Callable[[Step, Float[Tensor, "channels height width"], Bool[Tensor, "height width"]], None]) -> None:
+        """Call `visit(step, root, hole)` for every frame; a full pass over the files."""
+        name = f"sweep {self.stream.sweep.light} {self.stream.sweep.direction}: scattering"
+        for step in steps(self.stream, self.full, self.mask):
+            hole = self.band.hole(step)
+            self.clipped_elsewhere.logical_or_(step.saturated.any(0) & ~hole)
+            visit(step, signed_root(step.values, self.n_d), hole)
+            self.progress(name, step.index + 1, len(self.stream))
+
+    def profiles(self) -> Profiles:
+        """Pass over the sweep and keep each pixel's window."""
+        window = _Window(self)
+        self.walk(window.add)
+        return window.profiles()
+
+    def picture(self, values: Float[Tensor, "channels P"]) -> Float[Tensor, "channels height width"]:
+        """Values of the object's pixels as a picture, nothing elsewhere."""
+        result = torch.zeros_like(self.full)
+        result[:, self.mask] = values.to(result)
+        return result
+
+
+class _Window:
+    """Frames around each pixel's passage, filled as they come."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        band, mask = evidence.band, evidence.mask
+        self.mask = mask
+        self.reach = math.ceil(band.half + band.edge) + evidence.reach
+        self.size = 2 * self.reach + 1
+        self.centre = band.passage.centre[mask]
+        self.first_index = self.centre.round().long() - self.reach
+        channels, pixels = len(evidence.full), int(mask.sum())
+        self.root = torch.zeros((self.size, channels, pixels))
+        self.saturated = torch.zeros((self.size, channels, pixels), dtype=torch.bool)
+        self.hole = torch.zeros((self.size, pixels), dtype=torch.bool)
+        self.present = torch.zeros((self.size, pixels), dtype=torch.bool)
+        self.light = torch.zeros((self.size, pixels))
+        self.rest = torch.zeros((channels, pixels))
+        self.evidence = evidence
+
+    def add(self, step: Step, root: Tensor, hole: Tensor) -> None:
+        slot = step.index - self.first_index
+        inside = (slot >= 0) & (slot < self.size)
+        where, pixels = slot[inside], inside.nonzero()[:, 0]
+        values = root[:, self.mask]
+        self.rest += values * ~inside
+        self.root[where, :, pixels] = values[:, pixels].T
+        self.saturated[where, :, pixels] = step.saturated[:, self.mask][:, pixels].T
+        # A lost frame in the window is a hole too: its neighbours may be lit.
+        self.hole[where, pixels] = hole[self.mask][pixels] | step.lost
+        self.present[where, pixels] = not step.lost
+        self.light[where, pixels] = _light(self.evidence, step.index)[self.mask][pixels]
+
+    def profiles(self) -> Profiles:
+        index = self.first_index + torch.arange(self.size)[:, None]
+        return Profiles(
+            root=self.root,
+            offset=index - self.centre,
+            hole=self.hole,
+            present=self.present,
+            saturated=self.saturated,
+            light=_relative(self.light, (index - self.centre).abs() <= max(0.5, self.evidence.band.half)),
+            rest=self.rest,
+        )
+
+
+def _light(evidence: Evidence, index: int) -> Float[Tensor, "height width"]:
+    """What the slab of a frame lights, summed across it and blurred along it."""
+    band = evidence.band
+    lit = ((index - band.passage.centre).abs() <= band.half) & evidence.mask
+    along = 1 if evidence.stream.sweep.direction == "x" else 0
+    line = (evidence.full.mean(0).clamp(min=0.0) * lit).sum(along)
+    radius = min(6, len(line) - 1)
+    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / BLUR_PX) ** 2)
+    line = torch.nn.functional.conv1d(line[None, None], (taps / taps.sum())[None, None], padding=radius)[0, 0]
+    return line.unsqueeze(along).expand_as(lit)
+
+
+def _relative(light: Tensor, own: Tensor) -> Tensor:
+    """Over its mean in the pixel's own frames; bounded, since a faint row says little."""
+    light = (light / (SATURATE*light.amax(0)).clamp(min=1e-12)).clamp(max=1.0)
+    mean = (light * own).sum(0) / own.sum(0).clamp(min=1)
+    return (light / mean.clamp(min=1e-12)).clamp(max=4.0)

@@ -1,0 +1,195 @@
+"""What stands in for the scattering in the holes that the lit band leaves: five ways, one interface.
+
+Each takes the evidence of a sweep and returns the root sum of its frames, holes filled. None but `profile` knows of a
+distance; each of the others stands for one nevertheless, that from which on it takes light for scattering.
+
+maximum        every frame: the largest value on the hole's rim (paper). The rim lies against the slab.
+interpolation  every frame: a smooth surface through the hole's surroundings (paper), by normalised convolution with
+               ever wider Gaussians.
+time           every pixel: a straight line across its own lit frames.
+orthogonal     every pixel: the mean of what the sweep of the same light the other way measured beside its own lit
+               interval (A u B = A + B - A n B: what one sweep lacks the other has, and the common part is averaged).
+               Without such a sweep: `time`.
+profile        every pixel: its profile as a sum of exponentials (reflectsep/scatter/kernel.py), with the distance a
+               setting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.filters import gaussian_blur2d
+from kornia.morphology import dilation
+from torch import Tensor
+
+from reflectsep.scatter.band import Evidence, Profiles
+from reflectsep.scatter.frames import Step
+from reflectsep.scatter.kernel import Slab, fill_by_profile
+
+Picture = Float[Tensor, "channels height width"]
+Mask = Bool[Tensor, "height width"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """What a filling may need beside the frames."""
+
+    slab: Slab
+    distance_px: float
+    noise: float
+    """Standard deviation of a root frame."""
+    partner: Evidence | None = None
+    """The sweep of the same light the other way."""
+    partner_gain: float = 1.0
+    """C of this sweep over C of the partner."""
+
+
+class Filling(Protocol):
+    """Root sum of a sweep's frames, holes filled, undivided by C."""
+
+    def __call__(self, evidence: Evidence, setting: Setting) -> Picture:
+        """Fill the holes and sum."""
+        ...
+
+
+def maximum(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
+    """Every frame's holes by the largest value around them."""
+    return _sum_frames(evidence, fill_by_maximum)
+
+
+def interpolation(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
+    """Every frame's holes by a smooth surface."""
+    return _sum_frames(evidence, fill_by_interpolation)
+
+
+def time(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
+    """Every pixel's lit frames by a straight line."""
+    profiles = evidence.profiles()
+    return evidence.picture(profiles.measured + fill_along_time(profiles))
+
+
+def orthogonal(evidence: Evidence, setting: Setting) -> Picture:
+    """Every pixel's lit frames by what the other sweep saw beside its own."""
+    if setting.partner is None:
+        return time(evidence, setting)
+    profiles = evidence.profiles()
+    before, after, _, _ = _neighbours(setting.partner.profiles())
+    count = profiles.hole.sum(0)
+    beside = _mean_of(_at_middle(before), _at_middle(after))
+    return evidence.picture(profiles.measured + setting.partner_gain * beside * count)
+
+
+def profile(evidence: Evidence, setting: Setting) -> Picture:
+    """Every pixel's lit frames by its fitted profile."""
+    profiles = evidence.profiles()
+    fill = fill_by_profile(profiles, setting.slab, distance_px=setting.distance_px, noise=setting.noise)
+    return evidence.picture(profiles.measured + fill)
+
+
+FILLINGS: dict[str, Filling] = {
+    "profile": profile,
+    "maximum": maximum,
+    "interpolation": interpolation,
+    "orthogonal": orthogonal,
+    "time": time,
+}
+
+
+def _sum_frames(evidence: Evidence, fill: Callable[[Picture, Mask, Mask], Picture]) -> Picture:
+    """Sum of the frames, each filled by itself; a lost frame counts as the mean of its filled neighbours."""
+    state = _FrameSum(evidence.full, evidence.mask, fill)
+    evidence.walk(state.add)
+    return state.total
+
+
+class _FrameSum:
+    def __init__(self, full: Tensor, mask: Tensor, fill: Callable[[Picture, Mask, Mask], Picture]) -> None:
+        self.mask, self.fill = mask, fill
+        self.total, self.before, self.gap = torch.zeros_like(full), torch.zeros_like(full), 0
+
+    def add(self, step: Step, root: Tensor, hole: Tensor) -> None:
+        if step.lost:
+            self.gap += 1
+            return
+        filled = self.fill(root, hole, self.mask) if hole.any() else root
+        self.total += filled + self.gap * (self.before + filled) / 2
+        self.before, self.gap = filled, 0
+
+
+def fill_by_maximum(frame: Picture, hole: Mask, mask: Mask) -> Picture:
+    """The largest value on the rim grows into the hole, a pixel at a time, until it is closed."""
+    kernel = torch.ones(3, 3)
+    known = mask & ~hole
+    if not known.any():
+        return frame * ~hole
+    low = float(frame[:, known].min()) - 1.0
+    values = torch.where(known, frame, low)
+    open_ = hole & mask
+    for _ in range(sum(frame.shape[-2:])):
+        if not open_.any():
+            break
+        grown = dilation(values[:, None], kernel, engine="convolution")[:, 0]
+        reached = open_ & (grown > low + 0.5).all(0)
+        values = torch.where(reached, grown, values)
+        open_ = open_ & ~reached
+        if not reached.any():
+            break
+    return torch.where(hole & mask & ~open_, values, torch.where(open_, 0.0, frame))
+
+
+def fill_by_interpolation(frame: Picture, hole: Mask, mask: Mask) -> Picture:
+    """Normalised convolution with Gaussians of growing width: the narrowest that reaches a pixel decides."""
+    known = (mask & ~hole).to(frame)
+    result, open_ = frame * ~hole, hole & mask
+    sigma = 1.0
+    while open_.any() and sigma < max(frame.shape[-2:]):
+        radius = min(int(3 * sigma), min(frame.shape[-2:]) - 1)
+        size = 2 * radius + 1
+        stack = torch.cat([frame * known, known[None]])[None]
+        blurred = gaussian_blur2d(stack, (size, size), (sigma, sigma), border_type="constant")[0]
+        reached = open_ & (blurred[-1] > 0.02)
+        result = torch.where(reached, blurred[:-1] / blurred[-1].clamp(min=1e-6), result)
+        open_ = open_ & ~reached
+        sigma *= 2.0
+    return result
+
+
+def fill_along_time(profiles: Profiles) -> Float[Tensor, "channels P"]:
+    """Sum over the holes of the line between the values on either side of them."""
+    before, after, since, until = _neighbours(profiles)
+    weight = (since / (since + until).clamp(min=1))[:, None]
+    line = torch.where(before.isnan(), after, torch.where(after.isnan(), before, torch.lerp(before, after, weight)))
+    return (line.nan_to_num(0.0) * profiles.hole[:, None]).sum(0)
+
+
+def _neighbours(profiles: Profiles) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Last value before and first after every frame that is no hole, NaN where there is none, and their distances."""
+    known = profiles.present & ~profiles.hole
+
+    def swept(order: list[int]) -> tuple[Tensor, Tensor]:
+        value = torch.full_like(profiles.root[0], torch.nan)
+        steps_since = torch.zeros_like(profiles.offset[0])
+        values, distances = torch.empty_like(profiles.root), torch.empty_like(profiles.offset)
+        for i in order:
+            value = torch.where(known[i], profiles.root[i], value)
+            steps_since = torch.where(known[i], 0.0, steps_since + 1)
+            values[i], distances[i] = value, steps_since
+        return values, distances
+
+    frames = list(range(len(known)))
+    before, since = swept(frames)
+    after, until = swept(frames[::-1])
+    return before, after, since, until
+
+
+def _at_middle(values: Tensor) -> Tensor:
+    return values[len(values) // 2]
+
+
+def _mean_of(a: Tensor, b: Tensor) -> Tensor:
+    """Mean of two, or the one that is there."""
+    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, (a + b) / 2)).nan_to_num(0.0)

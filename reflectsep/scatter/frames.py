@@ -1,0 +1,96 @@
+"""Frames of a sweep, checked, complete and ready to be summed.
+
+A shadow sweep becomes its complement (slab = full - shadow). A frame that the capture lost is never invented: it passes
+as a `Step` marked `lost`, whose values lie between those of its received neighbours. Whoever sums frames may use it for
+pixels far from the lit band, where profiles are smooth, and must treat it as a hole near the band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.data import Frame, FrameStream, Sweep
+from reflectsep.errors import SweepError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One step of a sweep."""
+
+    index: int
+    values: Float[Tensor, "channels height width"]
+    """Of the slab, linear, in the capture's units."""
+    saturated: Bool[Tensor, "channels height width"]
+    lost: bool = False
+
+
+def signed_root(values: Tensor, n_d: float) -> Tensor:
+    """sign(I) |I|^(1/n_d): noise around zero stays around zero in a sum over frames."""
+    return values if n_d == 1.0 else values.sign() * values.abs().pow(1.0 / n_d)
+
+
+def name_of(sweep: Sweep) -> str:
+    """A sweep as messages name it: light, direction and files."""
+    files = sweep.frames or sweep.video
+    return f"sweep of {sweep.light} along {sweep.direction}" + (f" ({files})" if files else "")
+
+
+def steps(
+    stream: FrameStream, full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"]
+) -> Iterator[Step]:
+    """Every step between the first and the last received frame, in order; two frames are held at a time.
+
+    Raises:
+        SweepError: a frame of the wrong size, out of order, or with values that are no numbers.
+    """
+    before: Step | None = None
+    for frame in stream:
+        step = _checked(frame, stream.sweep, full, mask)
+        if before is not None:
+            if step.index <= before.index:
+                raise SweepError(f"{name_of(stream.sweep)}: frame {step.index} follows frame {before.index}")
+            yield from _between(before, step)
+        yield step
+        before = step
+
+
+def _checked(frame: Frame, sweep: Sweep, full: Tensor, mask: Tensor) -> Step:
+    values = frame.values
+    if values.shape != full.shape:
+        raise SweepError(
+            f"{name_of(sweep)}, frame {frame.index}: {_size(values)}, but the full picture is {_size(full)}"
+        )
+    values = values.to(full.dtype)
+    if sweep.kind == "shadow":
+        values = full - values
+    bad = ~torch.isfinite(values) & mask
+    if bad.any():
+        raise SweepError(
+            f"{name_of(sweep)}, frame {frame.index}: {int(bad.sum())} values on the object are no finite numbers"
+        )
+    saturated = torch.zeros_like(values, dtype=torch.bool) if frame.saturated is None else frame.saturated
+    return Step(index=frame.index, values=torch.where(mask, values, 0.0), saturated=saturated & mask)
+
+
+def _between(before: Step, after: Step) -> Iterator[Step]:
+    gap = after.index - before.index
+    for i in range(1, gap):
+        values = _interpolated(before.values, after.values, i / gap)
+        clipped = before.saturated | after.saturated
+        yield Step(index=before.index + i, values=values, saturated=clipped, lost=True)
+
+
+def _interpolated(a: Tensor, b: Tensor, weight: float) -> Tensor:
+    """Geometrically where both are positive, since profiles fall exponentially; else, in the noise, linearly."""
+    both = (a > 0) & (b > 0)
+    geometric = a.clamp(min=1e-30).pow(1 - weight) * b.clamp(min=1e-30).pow(weight)
+    return torch.where(both, geometric, torch.lerp(a, b, weight))
+
+
+def _size(values: Tensor) -> str:
+    return "x".join(str(n) for n in reversed(values.shape))

@@ -1,0 +1,152 @@
+"""Which values enter Eq. 25, and what is done where it cannot be solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.filters import box_blur
+from torch import Tensor
+
+from reflectsep.data import PhotometricStack
+from reflectsep.scatter.exponent import GRID, Exponent, Samples, complete, solve_exponent
+from reflectsep.scatter.frames import name_of
+from reflectsep.scatter.options import ScatterOptions
+from reflectsep.scatter.passage import Passage
+
+MOST_SAMPLES = 20000
+FEWEST_SAMPLES = 24
+HIGHLIGHT_RANK = 0.85
+"""Pixels whose picture exceeds their own median over the lights by more than this part of all do are left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gains:
+    """Exponent and gains of all sweeps, and how they came about."""
+
+    n_d: float
+    n_d_sd: float
+    source: str
+    gains: tuple[float, ...]
+    gains_sd: tuple[float, ...]
+    lit_frames: tuple[float, ...]
+    warnings: tuple[str, ...]
+
+
+def exponents(options: ScatterOptions) -> tuple[float, ...]:
+    """Values of n_d for which the first pass sums roots."""
+    return GRID if options.n_d is None else (options.n_d,)
+
+
+def choose_samples(stack: PhotometricStack, light: int) -> Bool[Tensor, "channels height width"]:
+    """Values of a light's full picture for Eq. 25: on the object, bright enough, unclipped, without a highlight."""
+    full = stack.images[light]
+    typical = stack.images.median(0).values
+    level = full.mean(0)
+    bright = (full > 0.05 * _quantile(level[stack.mask], 0.99)) & stack.mask & ~stack.saturated[light]
+    if not bright.any():
+        return bright
+    excess = full / typical.clamp(min=1e-6)
+    quiet = bright & (excess <= _quantile(excess[bright], HIGHLIGHT_RANK)) & (full <= _quantile(full[bright], 0.97))
+    where = quiet.flatten().nonzero()[:, 0]
+    stride = max(1, -(-len(where) // MOST_SAMPLES))
+    chosen = torch.zeros(full.numel(), dtype=torch.bool)
+    chosen[where[::stride]] = True
+    return chosen.view_as(full)
+
+
+def _quantile(values: Tensor, q: float) -> Tensor:
+    """As torch's, for any number of values."""
+    ordered = values.flatten().sort().values
+    return ordered[min(len(ordered) - 1, int(q * len(ordered)))]
+
+
+def solve_gains(
+    stack: PhotometricStack,
+    lights: list[int],
+    passages: list[Passage],
+    samples: list[Bool[Tensor, "channels height width"]],
+    options: ScatterOptions,
+) -> Gains:
+    """Solve Eq. 25 over the sweeps that allow it; take C from the slab's geometry for the others."""
+    of = [_samples(stack, k, p, m) for k, p, m in zip(lights, passages, samples, strict=True)]
+    usable = [i for i, s in enumerate(of) if s is not None]
+    frames = [options.lit_frames or _lit_frames(p, stack.mask) for p in passages]
+    warnings: list[str] = []
+    found: Exponent | None = None
+    if usable:
+        found = solve_exponent([s for s in of if s is not None], exponents(options))
+    n_d, sd, source = _exponent(found, options, warnings)
+    gains, gains_sd = list(frames), [0.1 * f for f in frames]
+    for slot, i in enumerate(usable):
+        gains[i], gains_sd[i] = found.gains[slot], found.gains_sd[slot]  # type: ignore[union-attr]
+    for i in set(range(len(of))) - set(usable):
+        warnings.append(_geometry_warning(passages[i], frames[i], stack.mask))
+    return Gains(
+        n_d=n_d,
+        n_d_sd=sd,
+        source=source,
+        gains=tuple(gains),
+        gains_sd=tuple(gains_sd),
+        lit_frames=tuple(frames),
+        warnings=tuple(warnings),
+    )
+
+
+def _exponent(found: Exponent | None, options: ScatterOptions, warnings: list[str]) -> tuple[float, float, str]:
+    if options.n_d is not None:
+        return options.n_d, 0.0, "fixed"
+    if found is None or not found.identifiable:
+        why = "no pixel is fit for Eq. 25" if found is None else f"its standard deviation would be {found.n_d_sd:.2g}"
+        warnings.append(f"n_d cannot be told from the sweeps ({why}), as on an opaque object: 1 is taken")
+        return 1.0, float("inf"), "unidentifiable"
+    return found.n_d, found.n_d_sd, "estimated"
+
+
+def _geometry_warning(passage: Passage, frames: float, mask: Tensor) -> str:
+    clipped = float((passage.clipped & mask).sum() / mask.sum())
+    ratio = "the exposures in the manifest" if passage.sweep.exposure_s is not None else "equal exposures, none is given"
+    return (
+        f"{name_of(passage.sweep)}: C is the {frames:.2f} frames in which a patch is lit, not from Eq. 25 "
+        f"({clipped:.0%} of the object is clipped in lit frames), and rests on {ratio}"
+    )
+
+
+def _lit_frames(passage: Passage, mask: Tensor) -> float:
+    """Median over the pixels whose profile is as narrow as the slab."""
+    values = passage.lit_frames[mask]
+    return max(1.0, float(values[values < 2.0 * values.median()].median()))
+
+
+def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tensor) -> Samples | None:
+    full, total = stack.images[light], passage.total
+    sound = chosen & ~(passage.clipped | passage.lit_lost)
+    if int(sound.sum()) < FEWEST_SAMPLES:
+        return None
+    sound[sound.clone()] = complete(total[sound], full[sound])
+    if int(sound.sum()) < FEWEST_SAMPLES:
+        return None
+    inside = sound[chosen]
+    return Samples(
+        full=full[sound].double(),
+        instrument=_around(full, stack.mask)[sound].double(),
+        sums=passage.sums[:, inside],
+        noise=_fine_noise(full, stack.mask),
+    )
+
+
+def _around(full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"]) -> Tensor:
+    """Mean over the 5 x 5 neighbours on the object, the pixel itself left out."""
+    weight = mask.to(full)
+    values = box_blur((full * weight)[None], 5, border_type="constant")[0] * 25 - full * weight
+    count = box_blur(weight[None, None], 5, border_type="constant")[0] * 25 - weight
+    return torch.where(count > 0.5, values / count.clamp(min=0.5), full)
+
+
+def _fine_noise(full: Tensor, mask: Tensor) -> float:
+    """Robust spread of what a 3 x 3 second difference leaves, on the object."""
+    kernel = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
+    detail = torch.nn.functional.conv2d(full[:, None], kernel[None, None].to(full), padding=1)[:, 0] / 6.0
+    inner = torch.nn.functional.max_pool2d((~mask)[None, None].float(), 3, stride=1, padding=1)[0, 0] == 0
+    return float(1.4826 * detail[:, inner].abs().median()) if inner.any() else 0.0

@@ -1,0 +1,292 @@
+"""Scattering of every light from the slab sweeps (paper, section 6).
+
+Two passes over the frames of each sweep: when does the slab pass each pixel (passage.py), from which n_d and C follow
+(Eq. 25; gains.py, exponent.py); then the lit band is left out (band.py), the holes are filled (filling.py, kernel.py)
+and the n_d-root sum is divided by C (Eq. 24).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.filters import box_blur
+from torch import Tensor
+
+from reflectsep.data import FrameStream, PhotometricStack, Scattering, SweepReport
+from reflectsep.errors import SweepError
+from reflectsep.flags import Flag, mark
+from reflectsep.progress import Progress, silent
+from reflectsep.scatter.band import Evidence, LitBand
+from reflectsep.scatter.exponent import complete
+from reflectsep.scatter.filling import FILLINGS, Setting
+from reflectsep.scatter.frames import name_of, signed_root
+from reflectsep.scatter.gains import Gains, choose_samples, exponents, solve_gains
+from reflectsep.scatter.kernel import Slab
+from reflectsep.scatter.options import ScatterOptions
+from reflectsep.scatter.passage import Passage, speed_deviation, watch
+
+LEAST_COVERAGE = 0.9
+SAME_RATIO = 1.35
+"""Where C and the lit frames agree this well, exposures are equal and C, the more exact, is the slab's width."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Prepared:
+    """A sweep before its second pass."""
+
+    evidence: Evidence
+    slab: Slab
+    light: int
+    gain: float
+    reached: Bool[Tensor, "height width"]
+    """Its sum holds all the light that the full picture has."""
+    clipped_elsewhere: Bool[Tensor, "height width"]
+    """Filled while the frames pass."""
+    report: SweepReport
+
+
+def measure_scattering(
+    stack: PhotometricStack,
+    sweeps: Sequence[FrameStream],
+    *,
+    options: ScatterOptions | None = None,
+    progress: Progress = silent,
+) -> Scattering:
+    """Measure I_scat^(1/n_d) of every light of the stack from its sweeps (Eqs. 23 to 25).
+
+    Args:
+        stack: full pictures, linear, basis lights first.
+        sweeps: frames developed to the same units, dark-subtracted; read twice each. At least one for every basis
+            light; sweeps of one light along x and y are averaged. Kind `shadow` is taken from the full picture.
+        options: settings; the defaults where None.
+        progress: told after every frame.
+
+    Returns:
+        Roots of shape (lights, channels, height, width), zero off the object; measured where a light has a sweep,
+        mixed by alpha (Eq. 15) where it has none. With it n_d, a report of every sweep, flags, and warnings.
+
+    Raises:
+        SweepError: a basis light without a sweep, a sweep without a full picture, too few frames, a frame of the
+            wrong size or with values that are no numbers, or a sweep that is shorter than the object.
+    """
+    options = options or ScatterOptions()
+    lights = _lights(stack, sweeps)
+    chosen = [choose_samples(stack, k) for k in lights]
+    grid = torch.tensor(exponents(options), dtype=torch.float64)
+    passages = [
+        watch(stream, stack.images[k], stack.mask, exponents=grid, samples=c, progress=progress)
+        for stream, k, c in zip(sweeps, lights, chosen, strict=True)
+    ]
+    gains = solve_gains(stack, lights, passages, chosen, options)
+    prepared = _prepare(stack, sweeps, lights, passages, gains, options, progress)
+    warnings = list(gains.warnings) + _warn(prepared, options)
+    sums = torch.stack([_root_sum(p, prepared, gains.n_d, options) / p.gain for p in prepared])
+    noise = torch.stack([_root_sd(p, gains.n_d) for p in prepared])
+    root, root_sd, measured = _combine(stack, lights, sums, noise)
+    return Scattering(
+        root=root,
+        root_sd=root_sd,
+        measured=measured,
+        n_d=gains.n_d,
+        n_d_sd=gains.n_d_sd,
+        n_d_source=cast("str", gains.source),  # type: ignore[arg-type]
+        sweeps=tuple(p.report for p in prepared),
+        flags=_flags(stack, prepared),
+        warnings=tuple(warnings),
+    )
+
+
+def _lights(stack: PhotometricStack, sweeps: Sequence[FrameStream]) -> list[int]:
+    """Index of every sweep's light."""
+    if not stack.mask.any():
+        raise SweepError("the mask is empty: no pixel of the object to measure scattering at")
+    swept = [stream.sweep.light for stream in sweeps]
+    missing = [name for name in stack.names[:3] if name not in swept]
+    if missing:
+        raise SweepError(f"no sweep of basis light {', '.join(missing)}: expected one for each of {', '.join(stack.names[:3])}")
+    for stream in sweeps:
+        if stream.sweep.light not in stack.names:
+            raise SweepError(f"{name_of(stream.sweep)}: its light has no full picture; those there are {', '.join(stack.names)}")
+    return [stack.names.index(name) for name in swept]
+
+
+def _prepare(
+    stack: PhotometricStack,
+    sweeps: Sequence[FrameStream],
+    lights: list[int],
+    passages: list[Passage],
+    gains: Gains,
+    options: ScatterOptions,
+    progress: Progress,
+) -> list[_Prepared]:
+    steps_px = _steps_px(passages, stack.mask)
+    prepared = []
+    for i, (stream, k, passage) in enumerate(zip(sweeps, lights, passages, strict=True)):
+        reached, coverage = _coverage(stack.images[k], passage, stack.mask)
+        if coverage < LEAST_COVERAGE:
+            raise SweepError(
+                f"{name_of(stream.sweep)}: the slab reached {coverage:.0%} of the object, expected at least "
+                f"{LEAST_COVERAGE:.0%}: the sweep is shorter than the object"
+            )
+        lit_frames, gain = gains.lit_frames[i], gains.gains[i]
+        equal = options.lit_frames is None and 1 / SAME_RATIO < gain / lit_frames < SAME_RATIO
+        slab = _slab(gain if equal else lit_frames, steps_px[i])
+        # Frame over full picture of a pixel that the slab lights alone.
+        ratio = (gain / (2 * slab.half)) ** gains.n_d
+        level = options.threshold * ratio * stack.images[k].mean(0)
+        lit = stack.mask & ((passage.peak > options.threshold * ratio) | passage.clipped)
+        band = LitBand(
+            passage=passage,
+            half=slab.half,
+            edge=slab.edge,
+            lit=lit,
+            threshold=level if options.lit_band == "threshold" else None,
+        )
+        report = SweepReport(
+            light=stream.sweep.light,
+            direction=stream.sweep.direction,
+            gain=gain,
+            gain_sd=gains.gains_sd[i],
+            lit_frames=lit_frames,
+            speed_deviation=speed_deviation(passage, stack.images[k], stack.mask),
+            coverage=coverage,
+        )
+        elsewhere = torch.zeros_like(stack.mask)
+        evidence = Evidence(
+            stream=stream,
+            full=stack.images[k],
+            mask=stack.mask,
+            band=band,
+            n_d=gains.n_d,
+            reach=options.reach_frames,
+            clipped_elsewhere=elsewhere,
+            progress=progress,
+        )
+        prepared.append(
+            _Prepared(
+                evidence=evidence,
+                slab=slab,
+                light=k,
+                gain=gain,
+                reached=reached,
+                clipped_elsewhere=elsewhere,
+                report=report,
+            )
+        )
+    return prepared
+
+
+def _steps_px(passages: list[Passage], mask: Tensor) -> list[float]:
+    """Pixels a frame; sweeps along one axis share it where they nearly agree.
+
+    Under a tilted light the near and the far flank of an object differ, so that its median is off, to either side
+    according to the light; the rig moved the slab alike.
+    """
+    own = [p.step_px(mask) for p in passages]
+    shared = []
+    for i, passage in enumerate(passages):
+        same = [own[j] for j, p in enumerate(passages) if p.sweep.direction == passage.sweep.direction]
+        middle = float(torch.tensor(same).median())
+        shared.append(middle if max(same) < 1.6 * min(same) else own[i])
+    return shared
+
+
+def _slab(lit_frames: float, step_px: float) -> Slab:
+    half = max(0.5, lit_frames / 2)
+    frames_per_px = 1.0 / step_px
+    # Half a pixel's own extent, and a little for the passage's error.
+    edge = min(max(0.5 * frames_per_px + 0.05, 0.15), 0.8 * half)
+    return Slab(half=half, edge=edge, frames_per_px=frames_per_px)
+
+
+def _coverage(full: Tensor, passage: Passage, mask: Tensor) -> tuple[Tensor, float]:
+    """Pixels whose light the sweep holds whole, and their part of those bright enough to tell."""
+    grey, total = full.mean(0), passage.total.mean(0)
+    ordered = grey[mask].sort().values
+    bright = mask & (grey > max(0.03 * float(ordered[int(0.99 * (len(ordered) - 1))]), 1e-9))
+    if not bright.any():
+        return mask.clone(), 1.0
+    reached = mask.clone()
+    usable = bright & ~passage.clipped & ~passage.lit_lost
+    if usable.any():
+        # Means over neighbours: a faint pixel's noise says nothing about the sweep.
+        near = box_blur(torch.stack([total, grey])[None] * usable, 5, border_type="constant")[0]
+        reached[usable] = complete(near[0][usable], near[1][usable])
+    return reached, float(reached[bright].float().mean())
+
+
+def _warn(prepared: list[_Prepared], options: ScatterOptions) -> list[str]:
+    warnings = []
+    for p in prepared:
+        sweep, passage = p.evidence.stream.sweep, p.evidence.band.passage
+        gaps = passage.last - passage.first + 1 - passage.received
+        if gaps:
+            warnings.append(f"{name_of(sweep)}: {gaps} frames lost; their scattering is interpolated")
+        if p.report.coverage < 0.99:
+            warnings.append(f"{name_of(sweep)}: the slab reached {p.report.coverage:.1%} of the object")
+        if options.hole_filling == "orthogonal" and _partner(p, prepared) is None:
+            warnings.append(f"{name_of(sweep)}: no sweep of {sweep.light} the other way; its holes are filled along time")
+    return warnings
+
+
+def _partner(p: _Prepared, prepared: list[_Prepared]) -> _Prepared | None:
+    for other in prepared:
+        if other.light == p.light and other.report.direction != p.report.direction:
+            return other
+    return None
+
+
+def _root_sum(p: _Prepared, prepared: list[_Prepared], n_d: float, options: ScatterOptions) -> Tensor:
+    other = _partner(p, prepared) if options.hole_filling == "orthogonal" else None
+    setting = Setting(
+        slab=p.slab,
+        distance_px=options.distance_px,
+        noise=_root_noise(p, n_d),
+        partner=None if other is None else other.evidence,
+        partner_gain=1.0 if other is None else p.gain / other.gain,
+    )
+    return FILLINGS[options.hole_filling](p.evidence, setting) * p.evidence.mask
+
+
+def _root_noise(p: _Prepared, n_d: float) -> float:
+    return float(signed_root(torch.tensor(p.evidence.band.passage.noise), n_d))
+
+
+def _root_sd(p: _Prepared, n_d: float) -> Tensor:
+    """Noise of the frames in s: every frame's own, and three times it for each frame that had to be filled."""
+    passage = p.evidence.band.passage
+    holes = 2 * p.slab.half * p.evidence.band.lit
+    count = (passage.received - holes).clamp(min=0) + (3 * holes) ** 2
+    return (_root_noise(p, n_d) * count.sqrt() / p.gain * p.evidence.mask).expand_as(p.evidence.full)
+
+
+def _combine(
+    stack: PhotometricStack, lights: list[int], sums: Float[Tensor, "sweeps channels height width"], noise: Tensor
+) -> tuple[Tensor, Tensor, tuple[bool, ...]]:
+    """Average the sweeps of each light; mix the lights without one from the basis."""
+    index = torch.tensor(lights)
+    measured = tuple(k in lights for k in range(len(stack.names)))
+    root, variance = torch.zeros_like(stack.images), torch.zeros_like(stack.images)
+    for k in set(lights):
+        own = index == k
+        root[k] = sums[own].mean(0)
+        variance[k] = (noise[own] ** 2).sum(0) / int(own.sum()) ** 2
+    alpha = stack.alpha.to(root)
+    for j, has in enumerate(measured):
+        if not has:
+            root[j] = torch.einsum("k,kchw->chw", alpha[j], root[:3])
+            variance[j] = torch.einsum("k,kchw->chw", alpha[j] ** 2, variance[:3])
+    return root, variance.sqrt(), measured
+
+
+def _flags(stack: PhotometricStack, prepared: list[_Prepared]) -> Tensor:
+    flags = stack.flags
+    for p in prepared:
+        flags = mark(flags, p.evidence.band.lit, Flag.HOLE_FILLED)
+        flags = mark(flags, stack.mask & ~p.reached, Flag.NO_SWEEP_COVERAGE)
+        flags = mark(flags, p.clipped_elsewhere & stack.mask, Flag.SWEEP_SATURATED)
+    return flags

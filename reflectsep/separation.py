@@ -1,0 +1,280 @@
+"""The result: off-specular, local diffuse and scattering of an object, able to relight itself.
+
+Parameters are for lights of unit intensity; a picture is its light's intensity times the model, because light adds
+in radiance. Components, for basis light k of intensity t_k:
+
+    off-specular    t_k lobe(a_k + B d_k)         local diffuse   t_k (d_k)_+ ^ n_d
+    scattering      t_k (s_k)_+ ^ n_d             whole diffuse   t_k pos(d_k + s_k) ^ n_d
+
+For n_d != 1 the whole diffuse is not the sum of its two parts. Scattering is written as it was measured; inside the
+model it goes on below zero beyond the edge of an attached shadow, so there too the parts do not add up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from reflectsep.data import Fit, PhotometricStack, Scattering
+from reflectsep.errors import ResultError
+from reflectsep.flags import count
+from reflectsep.io.result import read_result, write_result
+from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_power, reflectance
+
+COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
+LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
+GREY, COLOUR = ("Y",), ("R", "G", "B")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Separation:
+    """Parameters and components of a separated object; everything is zero outside `mask`."""
+
+    names: tuple[str, ...]
+    """Lights of the fit, the basis first."""
+    alpha: Float[Tensor, "lights 3"]
+    light_vectors: Float[Tensor, "lights 3"] | None
+    """Direction times intensity; None where unknown, then only alpha relights."""
+    view: Float[Tensor, "3"]
+    mask: Bool[Tensor, "height width"]
+    flags: Int[Tensor, "height width"]
+    a: Float[Tensor, "3"]
+    n_s: Float[Tensor, ""]
+    n_d: Float[Tensor, ""]
+    softness: Float[Tensor, ""]
+    haze: Float[Tensor, ""]
+    d: Float[Tensor, "3 channels height width"]
+    s: Float[Tensor, "3 channels height width"]
+    B: Float[Tensor, "channels height width"]
+    d_sd: Float[Tensor, "3 channels height width"]
+    s_sd: Float[Tensor, "3 channels height width"]
+    B_sd: Float[Tensor, "channels height width"]
+    specular: Float[Tensor, "3 channels height width"]
+    local_diffuse: Float[Tensor, "3 channels height width"]
+    scattering: Float[Tensor, "3 channels height width"]
+    diffuse: Float[Tensor, "3 channels height width"]
+    """Whole diffuse of the basis lights: the picture without its highlight, by the model."""
+    highlight_free: Float[Tensor, "3 channels height width"]
+    """Picture minus specular: keeps what the model does not explain; the whole diffuse where the picture is clipped."""
+    residual: Float[Tensor, "lights channels height width"]
+    document: Mapping[str, Any]
+    """What `separation.json` says beside the globals: settings, versions, timings, statistics."""
+
+    @property
+    def basis(self) -> tuple[str, ...]:
+        """Names of the basis lights."""
+        return self.names[:3]
+
+    @property
+    def intensity(self) -> Float[Tensor, "3"]:
+        """Of the basis lights; ones where the lights are unknown."""
+        if self.light_vectors is None:
+            return torch.ones(3, dtype=self.d.dtype)
+        return self.light_vectors[:3].norm(dim=-1)
+
+    @property
+    def globals(self) -> Globals:
+        """The shared parameters as the model takes them."""
+        n_d = 1.0 if float(self.n_d) == 1.0 else self.n_d
+        return Globals(a=self.a, n_s=self.n_s, n_d=n_d, softness=self.softness, haze=self.haze)
+
+    def relight(self, alpha: Float[Tensor, "*lights 3"]) -> Float[Tensor, "*lights channels height width"]:
+        """Pictures under lights sum_k alpha_k L_k (Eqs. 15 and 21), linear, in the capture's units.
+
+        Batched and differentiable in alpha. Where the light vectors are known, the length of the mixed vector is the
+        light's intensity and scales the picture, so that `relight(2 * alpha) == 2 * relight(alpha)`; where they are
+        unknown, alpha enters Eq. 21 as it stands. Memory grows with the number of lights; loop over many.
+
+        Raises:
+            ValueError: alpha does not end in three numbers, or is not finite.
+        """
+        if alpha.shape[-1:] != (3,):
+            raise ValueError(f"alpha has shape {tuple(alpha.shape)}, expected (..., 3)")
+        if not bool(alpha.isfinite().all()):
+            raise ValueError("alpha is not finite")
+        lead = alpha.shape[:-1]
+        unit, intensity = self.unit_mix(alpha.reshape(-1, 3).to(self.d))
+        d, s = self.d.permute(2, 3, 1, 0), self.s.permute(2, 3, 1, 0)
+        B = self.B[0] if len(self.B) == 1 else self.B.mean(0)
+        pictures = reflectance(d, B, self.globals, s=s @ unit.mT, alpha=unit, width=edge_width(s, self.softness))
+        pictures = pictures.permute(3, 2, 0, 1) * intensity[:, None, None, None] * self.mask
+        return pictures.reshape(*lead, *pictures.shape[1:])
+
+    def unit_mix(self, alpha: Float[Tensor, "lights 3"]) -> tuple[Float[Tensor, "lights 3"], Float[Tensor, "lights"]]:
+        """Alpha among basis lights of unit intensity for a light of unit intensity, and the light's intensity."""
+        if self.light_vectors is None:
+            return alpha, torch.ones_like(alpha[:, 0])
+        vector = alpha @ self.light_vectors[:3]
+        # A light of no intensity has no direction; any finite one gives the black picture.
+        length = (vector.square().sum(-1) + torch.finfo(alpha.dtype).tiny).sqrt()
+        return alpha * self.intensity / length.clamp_min(1e-12)[:, None], length
+
+    def save(self, out: Path | str, *, overwrite: bool = False, previews: Mapping[str, Tensor] | None = None) -> None:
+        """Write the result folder, whole or not at all.
+
+        Raises:
+            ResultError: `out` exists and `overwrite` is false, or it is no result.
+        """
+        channels = GREY if self.d.shape[1] == 1 else COLOUR
+        layers: dict[str, dict[str, np.ndarray]] = {}
+        for name in COMPONENTS:
+            layers[f"{name}.exr"] = picture_channels(self.basis, getattr(self, name), channels)
+        layers["residual.exr"] = picture_channels(self.names, self.residual, channels)
+        layers["parameters.exr"] = self._parameters(channels)
+        write_result(out, layers, self._document(), overwrite, previews)
+
+    def _parameters(self, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
+        ranks = ("1", "2", "3")
+        planes: dict[str, np.ndarray] = {}
+        for prefix, stack in (("d", self.d), ("s", self.s), ("d_sd", self.d_sd), ("s_sd", self.s_sd)):
+            stem, tail = prefix.partition("_")[0], prefix.partition("_")[1] + prefix.partition("_")[2]
+            planes |= picture_channels(tuple(f"{stem}{k}{tail}" for k in ranks), stack, channels)
+        planes |= picture_channels(("B",), self.B[None], channels)
+        planes |= picture_channels(("B_sd",), self.B_sd[None], channels)
+        planes["flags"] = self.flags.numpy().astype(np.uint32)
+        planes["mask"] = self.mask.numpy().astype(np.uint32)
+        return planes
+
+    def _document(self) -> dict[str, Any]:
+        vectors = self.light_vectors
+        lights: dict[str, Any] = {}
+        for i, name in enumerate(self.names):
+            lights[name] = {"alpha": self.alpha[i].tolist()}
+            if vectors is not None:
+                lights[name]["vector"] = vectors[i].tolist()
+        shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "softness", "haze")}
+        return {
+            **self.document,
+            "basis": list(self.basis),
+            "lights": lights,
+            "view": self.view.tolist(),
+            "globals": shared,
+            "flags": count(self.flags),
+        }
+
+
+def picture_channels(names: tuple[str, ...], stack: Tensor, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """`stack` (names, channels, height, width) as planes `NAME.R` or `NAME.Y`."""
+    return {
+        f"{name}.{c}": np.ascontiguousarray(stack[i, j].detach().cpu().numpy().astype(np.float32))
+        for i, name in enumerate(names)
+        for j, c in enumerate(channels)
+    }
+
+
+def separate(
+    stack: PhotometricStack, scattering: Scattering | None, fit: Fit, document: Mapping[str, Any]
+) -> Separation:
+    """Components of every basis light from the fitted parameters."""
+    s_sd = torch.zeros_like(fit.d)
+    measured = fit.s[:3]
+    if scattering is not None:
+        if scattering.root_sd is not None:
+            s_sd = scattering.root_sd[:3].float() * stack.mask
+        intensity_root = fit.intensity[:3, None, None, None] ** (1.0 / float(fit.n_d))
+        measured = scattering.root[:3].float() / intensity_root
+    separation = Separation(
+        names=stack.names,
+        alpha=stack.alpha.float(),
+        light_vectors=None if stack.light_vectors is None else stack.light_vectors.float(),
+        view=stack.view.float(),
+        mask=stack.mask,
+        flags=fit.flags,
+        a=fit.a,
+        n_s=fit.n_s,
+        n_d=fit.n_d,
+        softness=fit.softness,
+        haze=fit.haze,
+        d=fit.d,
+        s=fit.s[:3],
+        B=fit.B,
+        d_sd=fit.d_sd,
+        s_sd=s_sd,
+        B_sd=fit.B_sd,
+        specular=torch.zeros_like(fit.d),
+        local_diffuse=torch.zeros_like(fit.d),
+        scattering=torch.zeros_like(fit.d),
+        diffuse=torch.zeros_like(fit.d),
+        highlight_free=torch.zeros_like(fit.d),
+        residual=fit.residual,
+        document=document,
+    )
+    return with_components(separation, stack, measured)
+
+
+def with_components(separation: Separation, stack: PhotometricStack, measured: Tensor) -> Separation:
+    """`separation` with its components filled in; `measured` is s_k as the sweeps gave it."""
+    t = separation.intensity[:, None, None, None]
+    d, B = separation.d.permute(2, 3, 1, 0), separation.B.mean(0)
+    u = lobe_argument(d, B, separation.a, torch.eye(3)).permute(2, 0, 1)[:, None]
+    specular = (t * lobe(u, separation.n_s, separation.haze) * stack.mask).expand_as(separation.d)
+    diffuse = separation.relight(torch.eye(3)) - specular
+    clipped = stack.saturated[:3] | ~stack.images[:3].isfinite()
+    return replace(
+        separation,
+        specular=specular.contiguous(),
+        local_diffuse=t * positive_power(separation.d, separation.n_d),
+        scattering=t * positive_power(measured, separation.n_d) * stack.mask,
+        diffuse=diffuse,
+        highlight_free=torch.where(clipped, diffuse, stack.images[:3].float() - specular),
+    )
+
+
+def load(folder: Path | str) -> Separation:
+    """Read a result folder back, tensors bit for bit.
+
+    Raises:
+        ResultError: not a result, another format, a damaged or missing file, or an inconsistent document.
+    """
+    folder = Path(folder)
+    layers, document = read_result(folder, LAYERS)
+    try:
+        return from_layers(layers, document)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ResultError(
+            f"{folder}: separation.json and the EXR layers do not belong together ({type(error).__name__}: {error})"
+        ) from error
+
+
+def from_layers(layers: Mapping[str, Mapping[str, np.ndarray]], document: Mapping[str, Any]) -> Separation:
+    """A separation from its layers and document."""
+    lights = document["lights"]
+    basis = tuple(document["basis"])
+    names = (*basis, *(name for name in lights if name not in basis))
+    parameters = layers["parameters.exr"]
+    channels = GREY if "d1.Y" in parameters else COLOUR
+
+    def stack(planes: Mapping[str, np.ndarray], rows: tuple[str, ...]) -> Tensor:
+        return torch.stack([torch.stack([torch.from_numpy(planes[f"{row}.{c}"]) for c in channels]) for row in rows])
+
+    vectors = [lights[name].get("vector") for name in names]
+    shared = {key: torch.tensor(document["globals"][key], dtype=torch.float32) for key in document["globals"]}
+    if any(not math.isfinite(v) for tensor in shared.values() for v in tensor.flatten().tolist()):
+        raise ValueError("a global is not finite")
+    ours = {"format", "checksums", "basis", "lights", "view", "globals", "flags"}
+    return Separation(
+        names=names,
+        alpha=torch.tensor([lights[name]["alpha"] for name in names], dtype=torch.float32),
+        light_vectors=None if None in vectors else torch.tensor(vectors, dtype=torch.float32),
+        view=torch.tensor(document["view"], dtype=torch.float32),
+        mask=torch.from_numpy(parameters["mask"].astype(np.int64)) > 0,
+        flags=torch.from_numpy(parameters["flags"].astype(np.int32)),
+        **shared,
+        d=stack(parameters, ("d1", "d2", "d3")),
+        s=stack(parameters, ("s1", "s2", "s3")),
+        B=stack(parameters, ("B",))[0],
+        d_sd=stack(parameters, ("d1_sd", "d2_sd", "d3_sd")),
+        s_sd=stack(parameters, ("s1_sd", "s2_sd", "s3_sd")),
+        B_sd=stack(parameters, ("B_sd",))[0],
+        **{name: stack(layers[f"{name}.exr"], basis) for name in COMPONENTS},
+        residual=stack(layers["residual.exr"], names),
+        document={key: value for key, value in document.items() if key not in ours},
+    )

@@ -1,0 +1,191 @@
+"""Writes simulated pictures as a capture folder with the lights to relight and the truth beside it.
+
+    capture.json  mask.png  full/L1.exr  sweep/L1/0000.exr  sweep_y/L1/0000.exr  dark.exr  dark_sweep.exr
+    heldout.json  heldout/L7.exr         truth/L1.exr (channels specular.Y, ...)  truth/*
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.data import Capture, Encoding, Light, Picture, Sweep
+from reflectsep.errors import SettingsError
+from reflectsep.io.capture import write_manifest
+from reflectsep.io.exr import write_channels
+from reflectsep.io.files import write_json
+from reflectsep.io.pictures import write_picture
+from reflectsep.synth.camera import exposed, noise, store, suffix
+from reflectsep.synth.rig import SimulatedRig
+
+Progress = Callable[[str, int, int], None]
+"""Told (stage, done, total)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedPictures:
+    """Noise-free pictures in the capture's units: of every light, held-out ones included."""
+
+    object: str
+    mask: Bool[Tensor, "height width"]
+    full: Mapping[str, Float[Tensor, "channels height width"]]
+    components: Mapping[str, Mapping[str, Float[Tensor, "channels height width"]]]
+    """By light, then by component."""
+    frame_counts: tuple[int, ...]
+    """Number of frames of every sweep of the rig, in its order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedFrame:
+    """One noise-free slab frame, at the exposure of the full pictures."""
+
+    sweep: int
+    """Which of the rig's sweeps."""
+    index: int
+    values: Float[Tensor, "channels height width"]
+
+
+def channel_names(channels: int) -> str:
+    """Y, or RGB."""
+    return "Y" if channels == 1 else "RGB"
+
+
+def write_capture(
+    folder: Path,
+    rig: SimulatedRig,
+    pictures: SimulatedPictures,
+    frames: Iterable[SimulatedFrame],
+    *,
+    seed: int,
+    progress: Progress | None = None,
+) -> Capture:
+    """Write everything but what only the caller knows; frames are taken one at a time, the manifest comes last.
+
+    Args:
+        folder: An existing folder.
+        rig: What took the pictures.
+        pictures: Noise-free pictures.
+        frames: Every frame of every sweep, in any order.
+        seed: Of the noise.
+        progress: Told about the stage "frames".
+
+    Returns:
+        The capture as written.
+
+    Raises:
+        SettingsError: a full picture is not finite, or all its pixels are zero.
+    """
+    camera, shape = rig.camera, next(iter(pictures.full.values())).shape
+    _check(pictures)
+    for light in rig.lights:
+        name = f"full/{light.name}"
+        picture = exposed(
+            camera, pictures.full[light.name], camera.full_exposure_s, sigma=camera.full_sigma, rng=noise(seed, name)
+        )
+        _store(rig, folder, name, picture)
+    if camera.has_dark:
+        _write_dark(rig, folder, "dark", camera.full_exposure_s, shape, seed)
+        if rig.sweeps:
+            _write_dark(rig, folder, "dark_sweep", camera.slab_exposure_s, shape, seed)
+    write_picture(folder / "mask.png", pictures.mask[None].to(torch.float32))
+    _write_truth(folder, rig, pictures)
+    total = sum(pictures.frame_counts)
+    for done, frame in enumerate(frames):
+        name = frame_folder(*rig.sweeps[frame.sweep]) + f"/{frame.index:04d}"
+        picture = exposed(
+            camera, frame.values, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name)
+        )
+        _store(rig, folder, name, picture)
+        if progress:
+            progress("frames", done + 1, total)
+    return write_manifest(folder, _manifest(folder, rig, pictures))
+
+
+def frame_folder(light: str, axis: Literal["x", "y"]) -> str:
+    """Where a sweep's frames are."""
+    return f"sweep/{light}" if axis == "x" else f"sweep_y/{light}"
+
+
+def write_layers(path: Path, layers: Mapping[str, Float[Tensor, "channels height width"]]) -> None:
+    """An EXR with channels LAYER.Y, or LAYER.R, LAYER.G, LAYER.B, float32."""
+    write_channels(
+        path,
+        {
+            f"{layer}.{channel}": plane.to(torch.float32).numpy()
+            for layer, values in layers.items()
+            for channel, plane in zip(channel_names(values.shape[0]), values, strict=True)
+        },
+    )
+
+
+def _check(pictures: SimulatedPictures) -> None:
+    for name, values in pictures.full.items():
+        if not bool(torch.isfinite(values).all()):
+            raise SettingsError(f"object {pictures.object}: its picture under {name} has values that are not finite")
+        if not bool((values > 0).any()):
+            raise SettingsError(f"object {pictures.object}: light {name} reaches no part of it that the camera sees")
+
+
+def _store(rig: SimulatedRig, folder: Path, name: str, picture: Tensor) -> None:
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    store(rig.camera, folder / name, picture)
+
+
+def _write_dark(rig: SimulatedRig, folder: Path, name: str, exposure_s: float, shape: torch.Size, seed: int) -> None:
+    nothing = torch.zeros(shape, dtype=torch.float64)
+    camera = rig.camera
+    picture = exposed(camera, nothing, exposure_s, sigma=0.0, rng=noise(seed, name), average=camera.dark_frames)
+    _store(rig, folder, name, picture)
+
+
+def _write_truth(folder: Path, rig: SimulatedRig, pictures: SimulatedPictures) -> None:
+    for light in rig.heldout:
+        write_picture(folder / "heldout" / f"{light.name}.exr", pictures.full[light.name].to(torch.float32))
+    write_json(folder / "heldout.json", {"lights": {light.name: _light(light) for light in rig.heldout}})
+    for name, components in pictures.components.items():
+        write_layers(folder / "truth" / f"{name}.exr", components)
+
+
+def _light(light: Light) -> dict[str, object]:
+    intensity = light.intensity[0] if len(light.intensity) == 1 else list(light.intensity)
+    return {"direction": list(light.direction or ()), "intensity": intensity}
+
+
+def _manifest(folder: Path, rig: SimulatedRig, pictures: SimulatedPictures) -> Capture:
+    camera, ending = rig.camera, suffix(rig.camera)
+    height, width = pictures.mask.shape
+    images = [
+        Picture(kind="full", light=light.name, file=f"full/{light.name}{ending}", exposure_s=camera.full_exposure_s)
+        for light in rig.lights
+    ]
+    if camera.has_dark:
+        images.append(Picture(kind="dark", file=f"dark{ending}", exposure_s=camera.full_exposure_s))
+    sweeps = tuple(
+        Sweep(
+            light=light,
+            direction=axis,
+            exposure_s=camera.slab_exposure_s,
+            frames=frame_folder(light, axis) + "/{:04d}" + ending,
+            count=count,
+            dark=f"dark_sweep{ending}" if camera.has_dark else None,
+        )
+        for (light, axis), count in zip(rig.sweeps, pictures.frame_counts, strict=True)
+    )
+    first, second, third = (light.name for light in rig.lights[:3])
+    return Capture(
+        folder=folder,
+        object=pictures.object,
+        encoding=Encoding() if camera.gamma is None else Encoding(kind="gamma", gamma=camera.gamma),
+        size=(width, height),
+        mask="mask.png",
+        lights=rig.lights_by_name,
+        basis=(first, second, third),
+        images=tuple(images),
+        sweeps=sweeps,
+    )
