@@ -42,9 +42,9 @@ class RigSettings:
     lights: int = setting(6, "full pictures, the three basis lights included", at_least=3, at_most=500)
     basis_angle_deg: float = setting(25.0, "angle of the basis lights off the view", above=0.0, at_most=85.0)
     spread_deg: float = setting(30.0, "largest angle of the other lights off the view", above=0.0, at_most=85.0)
-    heldout: int = setting(3, "more lights, kept out of the capture to relight", at_least=0, at_most=100)
+    heldout: int = setting(3, "more lights inside the cone of the basis, kept out of the capture", at_least=0, at_most=100)
     sweeps: int = setting(3, "lights that are swept with a slab, the basis first; 0: none", at_least=0)
-    orthogonal: bool = setting(True, "sweep each of them along y as well as along x")
+    orthogonal: bool = setting(False, "sweep each of them along y as well as along x")
     slab_width_px: float = setting(4.0, "width of the slab", above=0.0)
     slab_step_px: float = setting(2.0, "its step from frame to frame", above=0.0)
     full_exposure_s: float = setting(0.01, "exposure of the full pictures", above=0.0)
@@ -73,16 +73,19 @@ class FitSettings:
     weights: Literal["paper", "noise"] = setting("paper", "of Eq. 22: the two lambdas, or each picture's noise")
     lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
     lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)
-    robust: Literal["huber", "cauchy", "none"] = setting("huber", "loss that weighs cast shadows down")
-    max_iterations: int = setting(60, "limit of the joint iterations", at_least=1)
+    scattering_sd: float = setting(
+        0.03, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
+    )
+    robust: Literal["huber", "none"] = setting("huber", "loss that weighs cast shadows down")
+    lobe: Literal["auto", "single"] = setting("auto", "haze and soft shadow edges where they pay, or the paper's formula")
+    max_iterations: int = setting(20, "limit of every joint solve", at_least=1)
     tolerance: float = setting(
         1e-6, "relative change of the cost that ends a pixel's iterations", above=0.0, at_most=1.0
     )
-    globals_pixels: int = setting(400, "pixels that start the globals", at_least=8)
-    chunk: int = setting(65536, "pixels handled at once; bounds the memory", at_least=1)
+    globals_pixels: int = setting(300, "pixels that start the globals", at_least=8)
+    chunk: int = setting(32768, "pixels handled at once; bounds the memory", at_least=1)
     prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
-    seed: int = setting(0, "of the choice of pixels", at_least=0)
 
     def __post_init__(self) -> None:
         check(self)
@@ -96,9 +99,12 @@ class ScatterSettings:
     hole_filling: Literal["profile", "time", "maximum", "interpolation", "orthogonal"] = setting(
         "profile", "what stands in where the slab itself lit"
     )
-    lit_band: Literal["threshold", "profile"] = setting("threshold", "how the lit band of a frame is found")
+    lit_band: Literal["threshold", "profile"] = setting("profile", "how the lit band of a frame is found")
     threshold: float = setting(0.25, "frame over full picture, above which a pixel is lit", above=0.0, at_most=1.0)
     n_d: float | None = setting(None, "exponent of the diffuse part; null: estimated", above=0.0, at_most=10.0)
+    distance_px: float = setting(
+        1.0, "light that leaves farther than this from where it entered counts as scattering", at_least=0.0
+    )
 
     def __post_init__(self) -> None:
         check(self)

@@ -176,6 +176,18 @@ def _may_replace(out: Path, overwrite: bool) -> None:
         raise ResultError(f"{out}: exists; choose another folder, or say overwrite=true")
 
 
+def refuse_existing(path: Path | str, overwrite: bool) -> None:
+    """Refuse an output that is already there before any work is done for it; an empty folder is free.
+
+    Raises:
+        ResultError: `path` exists and `overwrite` is false.
+    """
+    path = Path(path)
+    empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
+    if os.path.lexists(path) and not empty and not overwrite:
+        raise ResultError(f"{path}: exists; choose another place, or say overwrite=true")
+
+
 def _exchange(temporary: Path, out: Path) -> None:
     """Move `temporary` to `out`; what was there goes only after, and comes back if the move fails."""
     if not os.path.lexists(out):

@@ -24,10 +24,12 @@ from reflectsep.progress import Progress
 from reflectsep.scatter.frames import Step, signed_root, steps
 from reflectsep.scatter.passage import Passage
 
-
-SATURATE=.3
-BLUR_PX = 2.0
+BLUR_PX = 4.0
 """Along the slab, of the light it brings."""
+OUTSHINE = 1.1
+FULL_LIGHT = 0.3
+"""Part of the brightest row's sum from which on a slab is taken to bring all its light: what the camera sees of it
+depends on how a surface is turned, what enters does not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +43,8 @@ class Profiles:
     """Not scattering alone, or not received: to be filled."""
     present: Bool[Tensor, "frames P"]
     """Received."""
+    lit: Bool[Tensor, "P"]
+    """Pixels that the slab lights at all."""
     saturated: Bool[Tensor, "frames channels P"]
     light: Float[Tensor, "frames P"]
     """Light that a frame's slab brings to the object in the pixel's row (column, for a sweep along y), relative to the
@@ -67,6 +71,8 @@ class LitBand:
     edge: float
     lit: Bool[Tensor, "height width"]
     """Pixels that the slab lights at all."""
+    doubtful: Bool[Tensor, "height width"]
+    """Pixels whose brightest frame is too dark, against the full picture, to be sure of that: perhaps in shadow."""
     threshold: Float[Tensor, "height width"] | None
     """Grey value above which a frame near the passage counts as lit; None: the interval in time decides."""
 
@@ -92,7 +98,9 @@ class Evidence:
     """Pixels saturated in a frame that does not light them; written while the frames pass."""
     progress: Progress
 
-    def walk(self, visit: Callable[[Step, Float[Tensor, "channels height width"], Bool[Tensor, "height width"]], None]) -> None:
+    def walk(
+        self, visit: Callable[[Step, Float[Tensor, "channels height width"], Bool[Tensor, "height width"]], None]
+    ) -> None:
         """Call `visit(step, root, hole)` for every frame; a full pass over the files."""
         name = f"sweep {self.stream.sweep.light} {self.stream.sweep.direction}: scattering"
         for step in steps(self.stream, self.full, self.mask):
@@ -148,24 +156,36 @@ class _Window:
 
     def profiles(self) -> Profiles:
         index = self.first_index + torch.arange(self.size)[:, None]
+        lit = self._lit(index - self.centre)
         return Profiles(
             root=self.root,
             offset=index - self.centre,
-            hole=self.hole,
+            hole=self.hole & (lit | ~self.present),
             present=self.present,
+            lit=lit,
             saturated=self.saturated,
             light=_relative(self.light, (index - self.centre).abs() <= max(0.5, self.evidence.band.half)),
             rest=self.rest,
         )
 
+    def _lit(self, offset: Tensor) -> Tensor:
+        """A doubtful pixel is lit only if its own frames outshine the others: in a shadow those beside it do."""
+        band = self.evidence.band
+        value = self.root.mean(1)
+        own = (offset.abs() <= band.half) & self.present
+        mean = (value * own).sum(0) / own.sum(0).clamp(min=1)
+        beside = torch.where(self.present & ~self.hole, value, 0.0).amax(0)
+        shadowed = band.doubtful[self.mask] & own.any(0) & (mean < OUTSHINE * beside)
+        return band.lit[self.mask] & ~shadowed
+
 
 def _light(evidence: Evidence, index: int) -> Float[Tensor, "height width"]:
     """What the slab of a frame lights, summed across it and blurred along it."""
     band = evidence.band
-    lit = ((index - band.passage.centre).abs() <= band.half) & evidence.mask
+    lit = (band.half + 0.5 - (index - band.passage.centre).abs()).clamp(0.0, 1.0) * evidence.mask
     along = 1 if evidence.stream.sweep.direction == "x" else 0
     line = (evidence.full.mean(0).clamp(min=0.0) * lit).sum(along)
-    radius = min(6, len(line) - 1)
+    radius = min(12, len(line) - 1)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / BLUR_PX) ** 2)
     line = torch.nn.functional.conv1d(line[None, None], (taps / taps.sum())[None, None], padding=radius)[0, 0]
     return line.unsqueeze(along).expand_as(lit)
@@ -173,6 +193,6 @@ def _light(evidence: Evidence, index: int) -> Float[Tensor, "height width"]:
 
 def _relative(light: Tensor, own: Tensor) -> Tensor:
     """Over its mean in the pixel's own frames; bounded, since a faint row says little."""
-    light = (light / (SATURATE*light.amax(0)).clamp(min=1e-12)).clamp(max=1.0)
+    light = (light / (FULL_LIGHT * light.amax(0)).clamp(min=1e-12)).clamp(max=1.0)
     mean = (light * own).sum(0) / own.sum(0).clamp(min=1)
     return (light / mean.clamp(min=1e-12)).clamp(max=4.0)

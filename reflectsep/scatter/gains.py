@@ -18,7 +18,7 @@ from reflectsep.scatter.passage import Passage
 MOST_SAMPLES = 20000
 FEWEST_SAMPLES = 24
 HIGHLIGHT_RANK = 0.85
-"""Pixels whose picture exceeds their own median over the lights by more than this part of all do are left out."""
+"""Pixels whose picture stands out from their median over the lights more than in this part of all are left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,20 +40,23 @@ def exponents(options: ScatterOptions) -> tuple[float, ...]:
 
 
 def choose_samples(stack: PhotometricStack, light: int) -> Bool[Tensor, "channels height width"]:
-    """Values of a light's full picture for Eq. 25: on the object, bright enough, unclipped, without a highlight."""
-    full = stack.images[light]
-    typical = stack.images.median(0).values
-    level = full.mean(0)
-    bright = (full > 0.05 * _quantile(level[stack.mask], 0.99)) & stack.mask & ~stack.saturated[light]
+    """Values of a light's full picture for Eq. 25: on the object, bright enough, unclipped, without a highlight.
+
+    A pixel is chosen by its neighbours, never by its own noise: leaving out the brightest would bend Eq. 25.
+    """
+    near = torch.stack([_around(picture, stack.mask) for picture in stack.images])
+    own, typical = near[light], near.median(0).values
+    level = own.mean(0)
+    bright = (own > 0.05 * _quantile(level[stack.mask], 0.99)) & stack.mask & ~stack.saturated[light]
     if not bright.any():
         return bright
-    excess = full / typical.clamp(min=1e-6)
-    quiet = bright & (excess <= _quantile(excess[bright], HIGHLIGHT_RANK)) & (full <= _quantile(full[bright], 0.97))
+    excess = own / typical.clamp(min=1e-6)
+    quiet = bright & (excess <= _quantile(excess[bright], HIGHLIGHT_RANK)) & (own <= _quantile(own[bright], 0.97))
     where = quiet.flatten().nonzero()[:, 0]
     stride = max(1, -(-len(where) // MOST_SAMPLES))
-    chosen = torch.zeros(full.numel(), dtype=torch.bool)
+    chosen = torch.zeros(own.numel(), dtype=torch.bool)
     chosen[where[::stride]] = True
-    return chosen.view_as(full)
+    return chosen.view_as(own)
 
 
 def _quantile(values: Tensor, q: float) -> Tensor:
@@ -106,10 +109,13 @@ def _exponent(found: Exponent | None, options: ScatterOptions, warnings: list[st
 
 def _geometry_warning(passage: Passage, frames: float, mask: Tensor) -> str:
     clipped = float((passage.clipped & mask).sum() / mask.sum())
-    ratio = "the exposures in the manifest" if passage.sweep.exposure_s is not None else "equal exposures, none is given"
+    beside = float((passage.lost_near() & mask).sum() / mask.sum())
+    ratio = (
+        "the exposures in the manifest" if passage.sweep.exposure_s is not None else "equal exposures, none is given"
+    )
     return (
         f"{name_of(passage.sweep)}: C is the {frames:.2f} frames in which a patch is lit, not from Eq. 25 "
-        f"({clipped:.0%} of the object is clipped in lit frames), and rests on {ratio}"
+        f"({clipped:.0%} of the object is clipped in lit frames, {beside:.0%} has lost some), and rests on {ratio}"
     )
 
 
@@ -121,8 +127,12 @@ def _lit_frames(passage: Passage, mask: Tensor) -> float:
 
 def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tensor) -> Samples | None:
     full, total = stack.images[light], passage.total
-    sound = chosen & ~(passage.clipped | passage.lit_lost)
-    if int(sound.sum()) < FEWEST_SAMPLES:
+    # What stands in for a lost frame is the less exact the nearer the slab.
+    for frames in (5.0, 2.0):
+        sound = chosen & ~(passage.clipped | passage.lost_near(frames))
+        if int(sound.sum()) >= (10 if frames > 2.0 else 1) * FEWEST_SAMPLES:
+            break
+    else:
         return None
     sound[sound.clone()] = complete(total[sound], full[sound])
     if int(sound.sum()) < FEWEST_SAMPLES:

@@ -4,18 +4,24 @@ A line of light at distance t from a pixel adds A e^(-|t|/s) to it; a slab of ha
 integral over its width. Sources on either side have amplitudes of their own, four scales s or more are shared, and the
 lit frames hold a constant more, the light that entered at the pixel itself (local diffuse and specular):
 
-    P(u) = sum_i A-_i E-(u; s_i) + A+_i E+(u; s_i) + D [|u| < h],      all amplitudes >= 0
+    P(u) = Phi(u) sum_i [A-_i E-(u; s_i) + A+_i E+(u; s_i)] + D [|u| < h],      all amplitudes >= 0
     E-(u; s) = e^(min(u+h,0)/s) - e^(min(u-h,0)/s),    E+(u; s) = E-(-u; s),    sum over frames of E = 2 h
+
+Phi is the light that the slab brings to the object, relative to the pixel's own frames: none where it has left the
+object or crosses a shadow. Without it the cut-off profile of a pixel near the rim passes for a steep one, and on a flat
+disc as wide as five scales the sum came out 10 to 25 % too high.
 
 The line spread e^(-|t|/s) belongs to the radial spread K_0(r/s), since the integral of K_0(sqrt(t^2+y^2)/s) dy is
 pi s e^(-|t|/s). Of its light the part (d/s) K_1(d/s) left farther than d from where it entered. So the fitted profile
-says how much of the scattering is beyond any distance: the part nearer than d is taken off the sum of the filled frames.
+says how much of the scattering is beyond any distance: the part nearer than d is taken off the sum of filled frames.
+
+K_0 is pointed, as the spread of real media is. A round spread, e^(-r/s), has the same tails, and from frames that are
+two pixels apart the two cannot be told from each other: of such a body the scattering comes out 0 to 20 % too high.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -31,9 +37,6 @@ MODEL_ERROR = 0.05
 """Relative error of the sum of exponentials; noise counts against it."""
 RIDGE = 1e-3
 SWEEPS = 150
-FAM=[]
-STAT=[]
-LIGHT=True
 """Passes of the coordinate descent; more change the scattering by less than 0.1 %."""
 
 
@@ -55,46 +58,21 @@ def scales(slab: Slab) -> Float[Tensor, "scales"]:
     return SMALLEST_SCALE * 2.0 ** torch.arange(count, dtype=torch.float32)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spread:
-    """A radial spread of unit scale, as its line spread's integral and its light beyond a distance."""
-
-    name: str
-    integral: Callable[[Tensor], Tensor]
-    """Of the line spread from 0 to x >= 0, in parts of one side: 0 at 0, 1 far away."""
-    beyond: Callable[[Tensor], Tensor]
-    """Part of the light that leaves farther than x from where it entered."""
-
-
-def _round_integral(x: Tensor) -> Tensor:
-    """(2/pi) int_0^x t K_1(t) dt, by a table."""
-    step, last = 0.01, 20.0
-    t = torch.arange(0.5 * step, last, step, dtype=torch.float64)
-    table = torch.cat([torch.zeros(1, dtype=torch.float64), (t * torch.special.modified_bessel_k1(t)).cumsum(0)])
-    table = (table / table[-1]).to(x)
-    position = (x / step).clamp(max=len(table) - 1.001)
-    low = position.floor().long()
-    return torch.lerp(table[low], table[low + 1], position - low)
-
-
-def _pointed_beyond(x: Tensor) -> Tensor:
-    x = x.clamp(min=1e-6)
+def beyond(distance: float, s: Float[Tensor, "scales"]) -> Float[Tensor, "scales"]:
+    """Part (d/s) K_1(d/s) of the light of a K_0 spread that leaves farther than d from where it entered."""
+    x = (distance / s).clamp(min=1e-6)
     return x * torch.special.modified_bessel_k1(x)
 
 
-POINTED = Spread(name="K0", integral=lambda x: 1.0 - torch.exp(-x), beyond=_pointed_beyond)
-ROUND = Spread(name="exponential", integral=_round_integral, beyond=lambda x: (1.0 + x) * torch.exp(-x))
-
-
 def line_response(
-    u: Float[Tensor, "frames values"], half: float, s: Float[Tensor, "scales"], spread: Spread = POINTED
+    u: Float[Tensor, "frames values"], half: float, s: Float[Tensor, "scales"]
 ) -> Float[Tensor, "frames sides_scales values"]:
     """E- then E+ for every scale, of a slab at offset u; the sum over frames a unit step apart is 2 h."""
     columns = []
     for side in (u, -u):
         v, scale = side[:, None, :], s[:, None]
         far, near = ((half - v) / scale).clamp(min=0), ((-half - v) / scale).clamp(min=0)
-        columns.append(spread.integral(far) - spread.integral(near))
+        columns.append(torch.exp(-near) - torch.exp(-far))
     return torch.cat(columns, 1)
 
 
@@ -137,19 +115,16 @@ def _fill(profiles: Profiles, channel: int, slab: Slab, distance_px: float, nois
     s = scales(slab)
     measured = profiles.present & ~profiles.hole & ~clipped
     plateau = profiles.present & profiles.hole & ~clipped & (u.abs() <= slab.half - slab.edge)
-    response = torch.cat([line_response(u, slab.half, s, f) for f in FAM],1)
-    if LIGHT: response=response*profiles.light[:,None]
-    far=torch.cat([f.beyond(distance_px * slab.frames_per_px/s).repeat(2) for f in FAM])
+    response = line_response(u, slab.half, s) * profiles.light[:, None]
+    far = beyond(distance_px * slab.frames_per_px, s).repeat(2)
     columns = torch.cat([response, plateau[:, None, :].to(value)], 1)
     weight, size = _weights(value, measured, plateau, noise)
     weighted = columns * weight[:, None]
     normal = torch.einsum("fip,fjp->ijp", weighted, weighted)
     right = torch.einsum("fip,fp->ip", weighted, value * weight)
-    ridge = torch.cat([torch.full((2 * len(s)*len(FAM),), RIDGE), torch.full((1,), 1e-9)])
+    ridge = torch.cat([torch.full((2 * len(s),), RIDGE), torch.full((1,), 1e-9)])
     normal += torch.diag(ridge)[..., None] / size**2
-    x = nonnegative_least_squares(normal, right)
-    amplitude=x[:-1]
-    STAT.append(float((((value-torch.einsum('fip,ip->fp',columns,x))*weight)**2).sum(0).median()))
+    amplitude = nonnegative_least_squares(normal, right)[:-1]
     return _beyond_in_holes(profiles, value, clipped, response, amplitude, far, slab)
 
 
@@ -170,4 +145,4 @@ def _beyond_in_holes(
     filled = torch.where(bounded, torch.minimum(model, value.clamp(min=0.0)), model)
     kept = filled.sum(0) / model.sum(0).clamp(min=1e-20)
     near = 2.0 * slab.half * (amplitude * (1.0 - far)[:, None]).sum(0)
-    return filled.sum(0) - kept.clamp(max=1.0) * near * profiles.hole.any(0)
+    return filled.sum(0) - kept.clamp(max=1.0) * near * profiles.lit

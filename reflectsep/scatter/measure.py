@@ -30,6 +30,8 @@ from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage, speed_deviation, watch
 
 LEAST_COVERAGE = 0.9
+DOUBTFUL = 0.6
+"""A lit frame of a body that scatters all it does not reflect is about this part of what its light alone would give."""
 SAME_RATIO = 1.35
 """Where C and the lit frames agree this well, exposures are equal and C, the more exact, is the slab's width."""
 
@@ -107,10 +109,14 @@ def _lights(stack: PhotometricStack, sweeps: Sequence[FrameStream]) -> list[int]
     swept = [stream.sweep.light for stream in sweeps]
     missing = [name for name in stack.names[:3] if name not in swept]
     if missing:
-        raise SweepError(f"no sweep of basis light {', '.join(missing)}: expected one for each of {', '.join(stack.names[:3])}")
+        raise SweepError(
+            f"no sweep of basis light {', '.join(missing)}: expected one for each of {', '.join(stack.names[:3])}"
+        )
     for stream in sweeps:
         if stream.sweep.light not in stack.names:
-            raise SweepError(f"{name_of(stream.sweep)}: its light has no full picture; those there are {', '.join(stack.names)}")
+            raise SweepError(
+                f"{name_of(stream.sweep)}: its light has no full picture; those there are {', '.join(stack.names)}"
+            )
     return [stack.names.index(name) for name in swept]
 
 
@@ -138,12 +144,14 @@ def _prepare(
         # Frame over full picture of a pixel that the slab lights alone.
         ratio = (gain / (2 * slab.half)) ** gains.n_d
         level = options.threshold * ratio * stack.images[k].mean(0)
-        lit = stack.mask & ((passage.peak > options.threshold * ratio) | passage.clipped)
+        lit = stack.mask & ((passage.narrow & (passage.peak > options.threshold * ratio)) | passage.clipped)
         band = LitBand(
             passage=passage,
             half=slab.half,
-            edge=slab.edge,
+            # Of a slab no wider than its step the passage is known to a quarter of a frame only.
+            edge=slab.edge + (0.25 if slab.half < 0.75 else 0.0),
             lit=lit,
+            doubtful=(passage.peak < DOUBTFUL * ratio) & ~passage.clipped,
             threshold=level if options.lit_band == "threshold" else None,
         )
         report = SweepReport(
@@ -211,11 +219,15 @@ def _coverage(full: Tensor, passage: Passage, mask: Tensor) -> tuple[Tensor, flo
     if not bright.any():
         return mask.clone(), 1.0
     reached = mask.clone()
-    usable = bright & ~passage.clipped & ~passage.lit_lost
+    usable = bright & ~passage.clipped & ~passage.lost_near()
     if usable.any():
         # Means over neighbours: a faint pixel's noise says nothing about the sweep.
         near = box_blur(torch.stack([total, grey])[None] * usable, 5, border_type="constant")[0]
         reached[usable] = complete(near[0][usable], near[1][usable])
+    # Where the slab speeds up sums are smaller, but what it lit itself, not just before it stopped, it has passed.
+    peaks = passage.peak[bright].sort().values
+    inside = (passage.centre > passage.first + 1) & (passage.centre < passage.last - 1)
+    reached |= bright & inside & (passage.peak > 0.5 * peaks[int(0.95 * (len(peaks) - 1))])
     return reached, float(reached[bright].float().mean())
 
 
@@ -229,7 +241,9 @@ def _warn(prepared: list[_Prepared], options: ScatterOptions) -> list[str]:
         if p.report.coverage < 0.99:
             warnings.append(f"{name_of(sweep)}: the slab reached {p.report.coverage:.1%} of the object")
         if options.hole_filling == "orthogonal" and _partner(p, prepared) is None:
-            warnings.append(f"{name_of(sweep)}: no sweep of {sweep.light} the other way; its holes are filled along time")
+            warnings.append(
+                f"{name_of(sweep)}: no sweep of {sweep.light} the other way; its holes are filled along time"
+            )
     return warnings
 
 

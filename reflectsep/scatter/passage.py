@@ -23,6 +23,10 @@ from reflectsep.scatter.frames import Step, name_of, signed_root, steps
 
 MIN_FRAMES = 5
 SMOOTHING_PX = 2.0
+BROAD = 2.0
+"""A profile so many times wider than the typical one is no passage of the slab."""
+WEAK = 0.3
+"""Weight below which a pixel takes its passage from its neighbours."""
 JUMP_FRAMES = 1.5
 """A centroid farther than this from the local plane is a jump in depth, not noise."""
 
@@ -38,6 +42,8 @@ class Passage:
     """Largest q of a pixel."""
     lit_frames: Float[Tensor, "height width"]
     """Frames in which a pixel is lit; meaningless where it never is."""
+    narrow: Bool[Tensor, "height width"]
+    """The profile is as narrow as the slab and peaks where it passes. In a shadow it is broad, or peaks elsewhere."""
     total: Float[Tensor, "channels height width"]
     """Sum of the frames, linear."""
     clipped: Bool[Tensor, "height width"]
@@ -49,8 +55,12 @@ class Passage:
     """Standard deviation of a frame's pixel where it is dark, from differences along time."""
     sums: Float[Tensor, "exponents samples"]
     """Sums of the frames' roots at the sampled values, one row an exponent (for Eq. 25)."""
-    lit_lost: Bool[Tensor, "height width"]
-    """A frame near its passage was lost: its sum is not that of Eq. 25."""
+    lost_away: Float[Tensor, "height width"]
+    """Frames between a pixel's lit interval and the nearest lost frame; infinite where none was lost."""
+
+    def lost_near(self, frames: float = 2.0) -> Bool[Tensor, "height width"]:
+        """A frame near its passage was lost: its sum is not that of Eq. 25."""
+        return self.lost_away <= frames
 
     def step_px(self, mask: Bool[Tensor, "height width"]) -> float:
         """Pixels that the slab moves in a frame, over the whole object."""
@@ -139,16 +149,17 @@ class _Sums:
     def passage(self, sweep: Sweep, mask: Tensor, received: int) -> Passage:
         centroid = (self.q4t / self.q4.clamp(min=1e-30)).to(self.scale.dtype)
         lit = (self.q4**2 / self.q8.clamp(min=1e-60)).to(self.scale.dtype)
-        centre = _smooth(centroid, _trust(lit, self.q4, mask))
+        centre = _smooth(centroid, _trust(lit, self.peak, mask))
         width = float(lit[mask].median())
-        lit_lost = torch.zeros_like(mask)
+        lost_away = torch.full_like(centre, torch.inf)
         for index in self.lost:
-            lit_lost |= (centre - index).abs() <= width / 2 + 3.0
+            lost_away = torch.minimum(lost_away, (centre - index).abs() - width / 2)
         return Passage(
             sweep=sweep,
             centre=centre,
             peak=self.peak,
             lit_frames=lit,
+            narrow=(lit < BROAD * width) & ((centroid - centre).abs() <= JUMP_FRAMES),
             total=self.total,
             clipped=self.clipped,
             first=self.indices[0],
@@ -156,15 +167,15 @@ class _Sums:
             received=received,
             noise=float(torch.tensor(self.noises).quantile(0.25)) if self.noises else 0.0,
             sums=self.sums,
-            lit_lost=lit_lost,
+            lost_away=lost_away,
         )
 
 
-def _trust(lit: Tensor, q4: Tensor, mask: Tensor) -> Tensor:
-    """Weight of a pixel's centroid: none where its profile is broad, as in a shadow, or was never above nothing."""
-    typical = lit[mask].median()
-    sound = mask & (lit < 2.0 * typical) & (q4 > 1e-6)
-    return sound.to(lit.dtype)
+def _trust(lit: Tensor, peak: Tensor, mask: Tensor) -> Tensor:
+    """Weight of a pixel's centroid: none where its profile is broad, little where it is low, as in a shadow."""
+    narrow = mask & (lit < BROAD * lit[mask].median()) & (peak > 0)
+    typical = peak[narrow].median() if narrow.any() else peak.max()
+    return narrow * (peak / typical.clamp(min=1e-12)).clamp(max=1.0) ** 4
 
 
 def _smooth(centroid: Tensor, weight: Tensor) -> Tensor:
@@ -172,13 +183,13 @@ def _smooth(centroid: Tensor, weight: Tensor) -> Tensor:
     height, width = centroid.shape
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     result = centroid
-    filled = weight <= 0
+    weak = weight < WEAK
     for sigma in (SMOOTHING_PX, 4 * SMOOTHING_PX):
         plane, mass = _local_plane(centroid, weight, x.to(centroid), y.to(centroid), sigma)
         near = (plane - centroid).abs() <= JUMP_FRAMES
-        use = (mass > 0.05) & ((near & (weight > 0)) | filled) if sigma == SMOOTHING_PX else filled & (mass > 0.05)
+        use = (mass > 0.05) & (weak | (near & (sigma == SMOOTHING_PX)))
         result = torch.where(use, plane, result)
-        filled = filled & ~use
+        weak = weak & ~use
     return result
 
 
@@ -215,7 +226,7 @@ def speed_deviation(
     one over the speed at a pixel's passage, whatever the shape of the object. Taken over pixels passed together.
     """
     grey, total = full.mean(0), passage.total.mean(0)
-    sound = mask & ~passage.clipped & ~passage.lit_lost
+    sound = mask & ~passage.clipped & ~passage.lost_near()
     sound &= grey > 0.05 * grey[mask].max()
     frame = passage.centre.round().long()
     ratios = [(total / grey)[sound & (frame == i)] for i in range(passage.first, passage.last + 1)]

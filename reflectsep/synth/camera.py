@@ -68,9 +68,7 @@ def encoded(camera: SimulatedCamera, values: Float[Tensor, "*shape"]) -> Float[T
     return values.sign() * values.abs() ** (1 / camera.gamma)
 
 
-def store(
-    camera: SimulatedCamera, path_without_suffix: Path, values: Float[Tensor, "channels height width"]
-) -> Path:
+def store(camera: SimulatedCamera, path_without_suffix: Path, values: Float[Tensor, "channels height width"]) -> Path:
     """Encode, quantise and write one picture: `.exr` (float32) or `.png` (of 8 bits, or of 16 for more).
 
     A 12-bit code k is stored as the 16-bit value nearest to k 65535 / 4095, so that readers need not know the depth.

@@ -1,7 +1,7 @@
 """Writes simulated pictures as a capture folder with the lights to relight and the truth beside it.
 
-    capture.json  mask.png  full/L1.exr  sweep/L1/0000.exr  sweep_y/L1/0000.exr  dark.exr  dark_sweep.exr
-    heldout.json  heldout/L7.exr         truth/L1.exr (channels specular.Y, ...)  truth/*
+capture.json  mask.png  full/L1.exr  sweep/L1/0000.exr  sweep_y/L1/0000.exr  dark.exr  dark_sweep.exr
+heldout.json  heldout/L7.exr         truth/L1.exr (channels specular.Y, ...)  truth/*
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from reflectsep.io.exr import write_channels
 from reflectsep.io.files import write_json
 from reflectsep.io.pictures import write_picture
 from reflectsep.synth.camera import exposed, noise, store, suffix
+from reflectsep.synth.objects import SimulatedObject
 from reflectsep.synth.rig import SimulatedRig
 
 Progress = Callable[[str, int, int], None]
@@ -98,9 +99,7 @@ def write_capture(
     total = sum(pictures.frame_counts)
     for done, frame in enumerate(frames):
         name = frame_folder(*rig.sweeps[frame.sweep]) + f"/{frame.index:04d}"
-        picture = exposed(
-            camera, frame.values, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name)
-        )
+        picture = exposed(camera, frame.values, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
         if progress:
             progress("frames", done + 1, total)
@@ -122,6 +121,13 @@ def write_layers(path: Path, layers: Mapping[str, Float[Tensor, "channels height
             for channel, plane in zip(channel_names(values.shape[0]), values, strict=True)
         },
     )
+
+
+def write_geometry(path: Path, obj: SimulatedObject) -> None:
+    """An EXR with channels normal.X, .Y, .Z, depth (height towards the camera, pixels) and material (-1 is outside)."""
+    planes = {f"normal.{axis}": plane for axis, plane in zip("XYZ", obj.normals, strict=True)}
+    planes |= {"depth": obj.z, "material": obj.material}
+    write_channels(path, {name: plane.to(torch.float32).numpy() for name, plane in planes.items()})
 
 
 def _check(pictures: SimulatedPictures) -> None:

@@ -51,7 +51,7 @@ class Material:
                 )
         if max(self.scattering) > 0 and len(self.kernels) != len(self.scattering):
             raise SettingsError(
-                f"material {self.name}: {len(self.kernels)} kernels for {len(self.scattering)} channels, expected as many"
+                f"material {self.name}: {len(self.kernels)} kernels, expected {len(self.scattering)}: one a channel"
             )
         if not (self.specular >= 0 and 0 < self.roughness <= 1 and self.ior > 1 and self.diffuse_roughness_deg >= 0):
             raise SettingsError(

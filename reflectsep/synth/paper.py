@@ -3,8 +3,8 @@
     I_k = (d_k + s_k)_+^n_d + (a_k + B d_k)_+^n_s          k = 1..3                   (Eqs. 18, 19)
     I_j = (sum_i alpha_ij (d_i + s_i))_+^n_d + (sum_i alpha_ij (a_i + B d_i))_+^n_s     (Eqs. 20, 21)
 
-with d_k = q N.L_k (negative where the surface faces away), a_k = C_1 L_k.V and B = C_2 N.V / q, for a surface of normals
-N and albedo root q; a mirror's lobe has C_2 = -2 C_1. L_j = sum_i alpha_ij L_i (Eq. 15).
+with d_k = q N.L_k (negative where the surface faces away), a_k = C_1 L_k.V and B = C_2 N.V / q, for a surface of
+normals N and albedo root q; a mirror's lobe has C_2 = -2 C_1. L_j = sum_i alpha_ij L_i (Eq. 15).
 
 A sweep is made so that Eq. 25 holds in every pixel: of the root of the picture, the scattering is dealt out over the
 frames by the slab's distance, the rest goes to the frames in which the slab lights the pixel.
@@ -12,9 +12,8 @@ frames by the slab's distance, the rest goes to the frames in which the slab lig
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -25,7 +24,14 @@ from torch import Tensor
 from reflectsep.data import Light
 from reflectsep.errors import LightError, SettingsError
 from reflectsep.io.files import atomic_folder, write_json
-from reflectsep.synth.folder import Progress, SimulatedFrame, SimulatedPictures, write_capture, write_layers
+from reflectsep.synth.folder import (
+    Progress,
+    SimulatedFrame,
+    SimulatedPictures,
+    write_capture,
+    write_geometry,
+    write_layers,
+)
 from reflectsep.synth.objects import SimulatedObject, from_height, in_channels
 from reflectsep.synth.presets import bumps, plain_material
 from reflectsep.synth.rig import SimulatedCamera, SimulatedRig, make_rig, slab_coordinate, slab_frames
@@ -47,9 +53,9 @@ class PaperObject:
     n_s: float = 14.0
     C_1: float = -0.91
     """Below 0 for a forward lobe."""
-    mirror: float = 1.03
+    mirror: float = 1.015
     """C_2 = -2 C_1 mirror: 1 is a mirror's lobe."""
-    scattering: float = 0.25
+    scattering: float = 0.19
     """Typical scattering root s; 0 is none."""
     shape_seed: int = 0
 
@@ -88,6 +94,16 @@ class PaperPicture:
     diffuse: Float[Tensor, "channels height width"]
 
 
+@dataclass(frozen=True, kw_only=True)
+class SlabSchedule:
+    """A sweep over a surface that fills the picture."""
+
+    lit: Float[Tensor, "frames height width"]
+    """1 where the slab lights a pixel, else 0."""
+    share: Float[Tensor, "frames height width"]
+    """Weight of a pixel's scattering in each frame; sums to the number of frames in which it is lit."""
+
+
 def paper_rig(lights: int = 6, *, sigma: float = 0.0, sweeps: int = 0) -> SimulatedRig:
     """Lights 15 to 30 degrees off the view, three to relight inside the cone of the basis, noise against a peak of 1.
 
@@ -102,7 +118,7 @@ def paper_rig(lights: int = 6, *, sigma: float = 0.0, sweeps: int = 0) -> Simula
         basis_tilt_deg=28.0,
         spread_deg=(15.0, 30.0),
         heldout=(3, 0),
-        sweeps=sweeps,
+        sweeps=(sweeps, 0),
         camera=SimulatedCamera(full_sigma=sigma, frame_sigma=sigma),
     )
 
@@ -114,7 +130,7 @@ def paper_truth(obj: PaperObject, rig: SimulatedRig) -> PaperTruth:
     x, y = (torch.arange(n, dtype=torch.float64) / obj.size for n in (width, height))
     u, v = x.expand(height, width), y[:, None].expand(height, width)
     tint = torch.tensor(in_channels({"q": (1.10, 0.95, 0.80)}, obj.channels)["q"], dtype=torch.float64)
-    paint = 0.46 + 0.07 * bumps(u, v, obj.shape_seed + 11)
+    paint = 0.37 + 0.055 * bumps(u, v, obj.shape_seed + 11)
     # n_d makes the picture d^n_d: the root of an albedo, so that pictures stay as bright whatever n_d is.
     q = (tint[:, None, None] * paint) ** (1 / obj.n_d)
     basis = _vectors(rig.lights[:3])
@@ -160,8 +176,8 @@ def simulate_paper(
 ) -> Path:
     """Write a capture made exactly by the model, with truth beside it.
 
-    Besides what `synth.simulate` writes (here `scattering_beyond_Npx` are all the same, for the model knows no distance)
-    there are `truth/parameters.exr` (d1 d2 d3 s1 s2 s3 B), `truth/parameters.json` (globals, alpha) and
+    Besides what `synth.simulate` writes (the `scattering_beyond_Npx` are all the same, for the model knows no
+    distance) there are `truth/parameters.exr` (d1 d2 d3 s1 s2 s3 B), `truth/parameters.json` (globals, alpha) and
     `truth/scattering.exr` (scattering root s of every light, basis lights as they are and others mixed).
 
     Args:
@@ -189,7 +205,9 @@ def simulate_paper(
             mask=truth.surface.mask,
             full={name: picture.full for name, picture in made.items()},
             components={name: _components(picture) for name, picture in made.items()},
-            frame_counts=tuple(_slab(truth, rig, name, axis).shape[1] for name, axis in rig.sweeps),
+            frame_counts=tuple(
+                len(slab_schedule(truth.surface, rig.lights_by_name[name], axis, rig).lit) for name, axis in rig.sweeps
+            ),
         )
         frames = _frames(truth, rig, made, alpha)
         write_capture(folder, rig, pictures, frames, seed=seed, progress=progress)
@@ -213,37 +231,38 @@ def paper_alpha(lights: tuple[Light, ...]) -> Float[Tensor, "lights 3"]:
 
 
 def paper_frames(
-    truth: PaperTruth, picture: Float[Tensor, "channels height width"], s: Float[Tensor, "channels height width"],
-    light: Light, axis: Literal["x", "y"], slab_px: tuple[float, float],
-) -> Iterator[Float[Tensor, "channels height width"]]:  # fmt: skip
+    picture: Float[Tensor, "channels height width"],
+    s: Float[Tensor, "channels height width"],
+    schedule: SlabSchedule,
+    n_d: float,
+) -> Iterator[Float[Tensor, "channels height width"]]:
     """Frames whose roots sum to (slab width / step) times the root of the picture, pixel by pixel (Eq. 25).
 
     Args:
-        truth: Whose surface and n_d.
         picture: The full picture, not negative.
-        s: Its scattering root.
-        light: The light, with a direction.
-        axis: Direction of the sweep.
-        slab_px: Width and step of the slab.
+        s: Its scattering root, not negative.
+        schedule: The slab's way over the object.
+        n_d: Exponent of the root.
     """
-    assert light.direction is not None
-    points = truth.surface.points
-    lit = slab_frames(points, light.direction, axis, *slab_px)
-    shape = truth.surface.mask.shape
-    root = picture ** (1 / truth.n_d)
+    root = picture ** (1 / n_d)
     # In an attached shadow the picture may be darker than its scattering: there all of it is scattering.
     wandering = torch.minimum(s, root)
-    u = slab_coordinate(points, light.direction, axis)
+    for lit, share in zip(schedule.lit, schedule.share, strict=True):
+        yield (share * wandering + lit * (root - wandering)) ** n_d
+
+
+def slab_schedule(surface: SimulatedObject, light: Light, axis: Literal["x", "y"], rig: SimulatedRig) -> SlabSchedule:
+    """When a slab lights every pixel of a surface that fills the picture, and how its scattering is dealt out."""
+    assert light.direction is not None  # a rig has no light without one
+    lit = slab_frames(surface.points, light.direction, axis, rig.slab_width_px, rig.slab_step_px).to(torch.float64)
     times = torch.arange(lit.shape[1], dtype=torch.float64)
-    middle = (lit * times).sum(1) / lit.sum(1)
-    # Distance to the slab's middle: of the frame in which it is centred on the patch, shifted by where u is within it.
-    since = (u - u.min()) / slab_px[1]
-    offset = (middle - since).median()
-    shares = torch.exp(-(times - (since + offset)[:, None]).abs() * (slab_px[1] / FALL_PX))
-    shares = shares / shares.sum(1, keepdim=True) * lit.sum(1, keepdim=True)
-    for index in range(lit.shape[1]):
-        share, here = (column[:, index].reshape(shape) for column in (shares, lit.to(torch.float64)))
-        yield (share * wandering + here * (root - wandering)) ** truth.n_d
+    u = slab_coordinate(surface.points, light.direction, axis) / rig.slab_step_px
+    # When the slab's middle is over the patch: u but for a shift, which the lit frames give.
+    centred = u + ((lit * times).sum(1) / lit.sum(1) - u).mean()
+    share = torch.exp(-(times - centred[:, None]).abs() * (rig.slab_step_px / FALL_PX))
+    share = share * (lit.sum(1, keepdim=True) / share.sum(1, keepdim=True))
+    shape = (-1, *surface.mask.shape)
+    return SlabSchedule(lit=lit.mT.reshape(shape), share=share.mT.reshape(shape))
 
 
 def _surface(obj: PaperObject) -> SimulatedObject:
@@ -261,7 +280,9 @@ def _vectors(lights: tuple[Light, ...]) -> Float[Tensor, "lights 3"]:
     rows = []
     for light in lights:
         if light.direction is None or len(light.intensity) != 1:
-            raise LightError(f"light {light.name}: needs a direction and an intensity of one value for the paper's model")
+            raise LightError(
+                f"light {light.name}: needs a direction and an intensity of one value for the paper's model"
+            )
         towards = torch.tensor(light.direction, dtype=torch.float64)
         rows.append(towards / towards.norm() * light.intensity[0])
     return torch.stack(rows)
@@ -272,20 +293,13 @@ def _components(picture: PaperPicture) -> dict[str, Tensor]:
     return parts | {f"scattering{tail}": picture.scattering for tail in ("", "_beyond_1px", "_beyond_2px")}
 
 
-def _slab(truth: PaperTruth, rig: SimulatedRig, light: str, axis: Literal["x", "y"]) -> Tensor:
-    towards = rig.lights_by_name[light].direction
-    assert towards is not None
-    return slab_frames(truth.surface.points, towards, axis, rig.slab_width_px, rig.slab_step_px)
-
-
 def _frames(
     truth: PaperTruth, rig: SimulatedRig, made: dict[str, PaperPicture], alpha: dict[str, Tensor]
 ) -> Iterator[SimulatedFrame]:
     for sweep, (name, axis) in enumerate(rig.sweeps):
         s = torch.tensordot(alpha[name], truth.s, 1).clamp_min(0)
-        light = rig.lights_by_name[name]
-        slab = (rig.slab_width_px, rig.slab_step_px)
-        for index, values in enumerate(paper_frames(truth, made[name].full, s, light, axis, slab)):
+        schedule = slab_schedule(truth.surface, rig.lights_by_name[name], axis, rig)
+        for index, values in enumerate(paper_frames(made[name].full, s, schedule, truth.n_d)):
             yield SimulatedFrame(sweep=sweep, index=index, values=values)
 
 
@@ -296,7 +310,12 @@ def _write_parameters(
     write_layers(folder / "parameters.exr", layers | {"B": truth.B})
     roots = {light.name: torch.tensordot(alpha[light.name], truth.s, 1) for light in rig.lights}
     write_layers(folder / "scattering.exr", roots)
-    normals = {f"normal.{axis}": plane[None] for axis, plane in zip("XYZ", truth.surface.normals, strict=True)}
-    _write_planes(folder / "geometry.exr", normals | {"depth": truth.surface.z[None]})
-    facts = {"a": truth.a.tolist(), "n_s": truth.n_s, "n_d": truth.n_d, "C_1": obj.C_1, "C_2": -2 * obj.C_1 * obj.mirror}
+    write_geometry(folder / "geometry.exr", truth.surface)
+    facts = {
+        "a": truth.a.tolist(),
+        "n_s": truth.n_s,
+        "n_d": truth.n_d,
+        "C_1": obj.C_1,
+        "C_2": -2 * obj.C_1 * obj.mirror,
+    }
     write_json(folder / "parameters.json", facts | {"alpha": {name: mix.tolist() for name, mix in alpha.items()}})

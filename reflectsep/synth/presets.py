@@ -89,7 +89,7 @@ def marble(size: int, channels: int, seed: int) -> SimulatedObject:
     )
 
     def paint(x: Tensor, y: Tensor) -> Int[Tensor, "height width"]:
-        wave = _bumps(x / size, y / size, seed + 2)
+        wave = bumps(x / size, y / size, seed + 2)
         return ((torch.sin(14 * (x + 0.6 * y) / size + 5 * wave)).abs() < 0.22).to(torch.int64)
 
     return from_height("marble", _blob(size, seed + 3), size=(size, size), materials=(stone, vein), paint=paint)
@@ -157,6 +157,29 @@ OBJECTS: dict[str, Callable[[int, int, int], SimulatedObject]] = {
 """Every preset by name: (size, channels, seed) -> object."""
 
 
+def plain_material(name: str, channels: int) -> Material:
+    """An opaque grey material without a highlight, for objects whose reflectance is given otherwise."""
+    return _material(name, channels, diffuse=(0.5, 0.5, 0.5), scattering=(0, 0, 0), specular=0.0)
+
+
+def bumps(u: Float[Tensor, "*p"], v: Float[Tensor, "*p"], seed: int, waves: int = 7) -> Float[Tensor, "*p"]:
+    """A smooth random function of about -1..1: a few plane waves of 1.2 to 3.2 periods across the picture.
+
+    Args:
+        u: x as a fraction of the picture's size.
+        v: y as a fraction of it.
+        seed: Chooses the waves.
+        waves: How many.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    angle, phase, rate = torch.rand(3, waves, dtype=torch.float64, generator=generator)
+    total = torch.zeros_like(u)
+    for wave in range(waves):
+        along = u * math.cos(math.pi * angle[wave]) + v * math.sin(math.pi * angle[wave])
+        total = total + torch.sin(2 * math.pi * ((1.2 + 2 * rate[wave]) * along + phase[wave]))
+    return total / math.sqrt(waves)
+
+
 def _material(name: str, channels: int, *, diffuse: Colour, scattering: Colour, **rest: object) -> Material:
     values = in_channels({"diffuse": diffuse, "scattering": scattering}, channels)
     kernels = rest.pop("kernels", ())
@@ -171,17 +194,6 @@ def _exponentials(size: int, weights: tuple[float, ...], lengths: tuple[tuple[fl
     return tuple(ExponentialKernel(weights, tuple(length * size for length in channel)) for channel in lengths)
 
 
-def _bumps(u: Float[Tensor, "*p"], v: Float[Tensor, "*p"], seed: int, waves: int = 7) -> Float[Tensor, "*p"]:
-    """A smooth random function of about -1..1: a few plane waves of 1.2 to 3.2 periods across the picture."""
-    generator = torch.Generator().manual_seed(seed)
-    angle, phase, rate = torch.rand(3, waves, dtype=torch.float64, generator=generator)
-    total = torch.zeros_like(u)
-    for wave in range(waves):
-        along = u * math.cos(math.pi * angle[wave]) + v * math.sin(math.pi * angle[wave])
-        total = total + torch.sin(2 * math.pi * ((1.2 + 2 * rate[wave]) * along + phase[wave]))
-    return total / math.sqrt(waves)
-
-
 def _blob(size: int, seed: int) -> HeightFunction:
     """A flattened, slightly lopsided ball with bumps that fade towards its silhouette."""
 
@@ -191,7 +203,7 @@ def _blob(size: int, seed: int) -> HeightFunction:
         radius = 0.42 + 0.018 * torch.sin(2 * angle + seed + 0.7) + 0.012 * torch.sin(3 * angle + 2 * seed)
         rim = 1 - (u.square() + v.square()) / radius.square()
         inside = rim.clamp_min(0)
-        z = size * (0.30 * inside.sqrt() + 0.013 * inside * _bumps(u, v, seed))
+        z = size * (0.30 * inside.sqrt() + 0.013 * inside * bumps(u, v, seed))
         return torch.where(rim > 0, z, torch.nan)
 
     return height
@@ -208,7 +220,7 @@ def _box(size: int, seed: int) -> HeightFunction:
         inset = corner - outside - torch.maximum(across, up).clamp_max(0)
         rise = (1 - (inset / bevel).clamp(0, 1)).square()
         dome = 1 - 2.2 * u.square() - 2.0 * v.square()
-        z = size * (depth * (1 - rise).clamp_min(0).sqrt() * dome + 0.0022 * (1 - rise) * _bumps(u, v, seed))
+        z = size * (depth * (1 - rise).clamp_min(0).sqrt() * dome + 0.0022 * (1 - rise) * bumps(u, v, seed))
         return torch.where(inset > 0, z, torch.nan)
 
     return height

@@ -75,9 +75,10 @@ class SimulatedCamera:
         _require(self.dark_frames >= 1, f"{self.dark_frames} dark frames", "at least 1")
         _require(self.bits is None or 4 <= self.bits <= 16, f"{self.bits} bits", "None or 4 to 16")
         _require(self.saturation is None or self.saturation > 0, f"saturation {self.saturation}", "above 0")
-        _require(self.bits is None or (self.saturation or 1) <= 1, f"saturation {self.saturation}", "at most 1 with bits")
+        _require(
+            self.bits is None or (self.saturation or 1) <= 1, f"saturation {self.saturation}", "at most 1 with bits"
+        )
         _require(self.gamma is None or self.gamma > 0, f"gamma {self.gamma}", "above 0")
-
 
     @property
     def has_dark(self) -> bool:
@@ -195,8 +196,7 @@ def make_rig(
     basis_tilt_deg: float = 30.0,
     spread_deg: tuple[float, float] = (15.0, 35.0),
     heldout: tuple[int, int] = (3, 1),
-    sweeps: int = 3,
-    orthogonal_sweeps: int = 0,
+    sweeps: tuple[int, int] = (3, 0),
     slab_px: tuple[float, float] = (4.0, 2.0),
     camera: SimulatedCamera | None = None,
 ) -> SimulatedRig:
@@ -208,8 +208,7 @@ def make_rig(
         basis_tilt_deg: Angle of the basis lights off the view.
         spread_deg: Smallest and largest angle of the others.
         heldout: Lights to relight inside the cone of the basis, and outside it.
-        sweeps: Lights swept along x, the basis first.
-        orthogonal_sweeps: Lights also swept along y.
+        sweeps: Lights swept along x, and along y; the basis first.
         slab_px: Width and step of the slab.
         camera: The camera; a perfect one by default.
 
@@ -219,8 +218,8 @@ def make_rig(
     """
     if not (0 < basis_tilt_deg < 90 and 0 <= spread_deg[0] <= spread_deg[1] < 90):
         raise SettingsError(f"rig {name}: angles {basis_tilt_deg}, {spread_deg} degrees, expected 0 to 90")
-    if not max(sweeps, orthogonal_sweeps) <= lights:
-        raise LightError(f"rig {name}: {max(sweeps, orthogonal_sweeps)} lights to sweep, but it has {lights}")
+    if not max(sweeps) <= lights:
+        raise LightError(f"rig {name}: {max(sweeps)} lights to sweep, but it has {lights}")
     basis = [(basis_tilt_deg, azimuth) for azimuth in (90.0, 210.0, 330.0)]
     inside, outside = heldout
     # The cone of the basis narrows to half its width between two of its lights.
@@ -234,8 +233,8 @@ def make_rig(
         heldout=_lights(lights + 1, [*kept_in, *kept_out]),
         slab_width_px=slab_px[0],
         slab_step_px=slab_px[1],
-        sweep_x=tuple(names[:sweeps]),
-        sweep_y=tuple(names[:orthogonal_sweeps]),
+        sweep_x=tuple(names[: sweeps[0]]),
+        sweep_y=tuple(names[: sweeps[1]]),
         camera=camera or SimulatedCamera(),
     )
 

@@ -18,9 +18,8 @@ from torch import Tensor
 
 from reflectsep.data import Light, Vector
 from reflectsep.errors import SettingsError
-from reflectsep.io.exr import write_channels
 from reflectsep.io.files import atomic_folder, write_json
-from reflectsep.synth.folder import Progress, SimulatedFrame, SimulatedPictures, write_capture
+from reflectsep.synth.folder import Progress, SimulatedFrame, SimulatedPictures, write_capture, write_geometry
 from reflectsep.synth.objects import SimulatedObject
 from reflectsep.synth.rig import SimulatedRig, slab_frames
 from reflectsep.synth.shading import irradiance, local_diffuse, specular
@@ -81,7 +80,7 @@ def simulate(
         lit = _light_up(obj, scattering, lights, progress)
         pictures, scale = _pictures(obj, rig, scattering, lit, progress)
         write_capture(folder, rig, pictures, _frames(obj, rig, scattering, lit, scale), seed=seed, progress=progress)
-        _write_geometry(folder / "truth" / "geometry.exr", obj)
+        write_geometry(folder / "truth" / "geometry.exr", obj)
         write_json(folder / "truth" / "simulation.json", _facts(obj, rig, scattering, scale, seed))
     return Path(out)
 
@@ -166,9 +165,7 @@ def _wandering(
     result = {}
     for index, (key, px) in enumerate(keys.items()):
         spread = scattering.spread(columns, px)
-        result[key] = {
-            name: light.intensity[:, None] * spread[..., at] for at, (name, light) in enumerate(lit.items())
-        }
+        result[key] = {name: light.intensity[:, None] * spread[..., at] for at, (name, light) in enumerate(lit.items())}
         if progress:
             progress("transport", index + 1, len(keys))
     return result
@@ -197,12 +194,6 @@ def _frames(
             light = lit[rig.sweeps[sweep][0]]
             patches = slabs[sweep][:, index] * light.direct + light.intensity[:, None] * spread[..., column]
             yield SimulatedFrame(sweep=sweep, index=index, values=obj.picture(scale * patches))
-
-
-def _write_geometry(path: Path, obj: SimulatedObject) -> None:
-    planes = {f"normal.{axis}": plane for axis, plane in zip("XYZ", obj.normals, strict=True)}
-    planes |= {"depth": obj.z, "material": obj.material}
-    write_channels(path, {name: plane.to(torch.float32).numpy() for name, plane in planes.items()})
 
 
 def _facts(

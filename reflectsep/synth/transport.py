@@ -4,8 +4,8 @@
 
 E irradiance, A = 1 / N.V the area of a patch, t_out = 1 - F(N.V) on the way out, t_in = 1 - F(N.L) on the way in (it
 belongs to the light, and is applied by `transmitted`), rho the material's scattering albedo, R its kernel, r the chord
-between the patches. K is symmetric (reciprocity), also across materials. Light that leaves within the patch it entered is none of
-this operator's: `self_share` gives it, and it counts as local.
+between the patches. K is symmetric (reciprocity), also across materials. Light that leaves within the patch it entered
+is none of this operator's: `self_share` gives it, and it counts as local.
 
 "Beyond N pixels" weighs each pair by clamp(r - N + 1/2, 0, 1): the share of two pixel footprints that far apart that is
 more than N apart, roughly; a hard threshold would jump between a flat and a slightly tilted part of the surface.
@@ -204,9 +204,6 @@ def _spectra(shape: Sequence[int], kernels: tuple[tuple[Kernel, ...], ...], beyo
     share = (r - (beyond_px - 0.5)).clamp(0, 1) if beyond_px > 0 else (r > 0).to(r.dtype)
     channels = len(kernels[0])
     return [
-        [
-            [torch.fft.rfft2((ours[c](r) * theirs[c](r)).sqrt() * share).real for theirs in kernels]
-            for ours in kernels
-        ]
+        [[torch.fft.rfft2((ours[c](r) * theirs[c](r)).sqrt() * share).real for theirs in kernels] for ours in kernels]
         for c in range(channels)
     ]

@@ -29,7 +29,9 @@ class Stream:
         for i, values in enumerate(self.frames):
             if i not in self.lost:
                 clipped = None if self.clip is None else values >= self.clip
-                yield Frame(index=i, values=values if self.clip is None else values.clamp(max=self.clip), saturated=clipped)
+                yield Frame(
+                    index=i, values=values if self.clip is None else values.clamp(max=self.clip), saturated=clipped
+                )
 
 
 @dataclass
@@ -46,7 +48,9 @@ class Body:
     channels: int = 1
 
     def __post_init__(self):
-        y, x = torch.meshgrid(torch.arange(SIZE, dtype=torch.float64), torch.arange(SIZE, dtype=torch.float64), indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(SIZE, dtype=torch.float64), torch.arange(SIZE, dtype=torch.float64), indexing="ij"
+        )
         c = (SIZE - 1) / 2
         self.x, self.y = x, y
         self.mask = (x - c) ** 2 + (y - c) ** 2 < 9.7**2
@@ -62,7 +66,7 @@ class Body:
         slope = [(0.03, 0.0), (-0.02, 0.02), (0.0, -0.03)][light]
         e = (0.8 + slope[0] * (self.x - 12) + slope[1] * (self.y - 12)).clamp(min=0) * self.mask
         if self.shadow:
-            e = e * ~((self.x > 10) & (self.x < 15) & (self.y > 12))
+            e = e * ~((self.x > 7) & (self.x < 17) & (self.y > 12))
         return e
 
     def picture(self, e):
@@ -78,7 +82,9 @@ class Body:
         along = self.x if direction == "x" else self.y
         frames, low = [], start_px
         while low < until_px:
-            covered = (torch.minimum(along + 0.5, torch.tensor(low + self.width_px)) - (along - 0.5).clamp(min=low)).clamp(min=0)
+            covered = (
+                torch.minimum(along + 0.5, torch.tensor(low + self.width_px)) - (along - 0.5).clamp(min=low)
+            ).clamp(min=0)
             frames.append(self.picture(self.entering(light) * covered))
             low += self.step_px
         return frames

@@ -1,0 +1,127 @@
+"""The compare job: a result beside Lin & Lee's, beside held-out pictures, and beside the truth where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from reflectsep.data import Capture
+from reflectsep.io.exr import read_channels
+from reflectsep.io.lights import read_lights
+from reflectsep.io.pictures import read_picture
+from reflectsep.relight import alphas_for
+from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
+from reflectsep.report.metrics import psnr, relative_rms
+from reflectsep.separation import Separation
+
+
+def compare_result(
+    ours: Separation,
+    baseline: Separation,
+    capture: Capture,
+    heldout: Sequence[str],
+    pictures: tuple[Tensor, Tensor] | None,
+    out: Path,
+) -> str:
+    """Draw the figure; returns its numbers as text.
+
+    `pictures` are the held-out lights' real pictures and which of their values are clipped. Pictures in the capture's
+    `heldout/` folder, of the lights in its `heldout.json`, are compared as well.
+    """
+    rows = [component_row(ours, baseline, i) for i in range(3)]
+    relit = left_out(ours, baseline, capture, heldout, pictures) + beside(ours, baseline, capture)
+    write_comparison(out, rows, relit, mask=ours.mask, title=str(ours.document.get("object", "")))
+    lines = [str(out)]
+    for light in relit:
+        mask = ours.mask if light.counts is None else ours.mask & light.counts
+        scores = [psnr(picture, light.real, mask) for picture in (light.ours, light.baseline)]
+        lines.append(f"  {light.light:12s} ours {scores[0]:5.1f} dB, Lin & Lee {scores[1]:5.1f} dB")
+    return "\n".join([*lines, *truth_lines(ours, baseline, capture)])
+
+
+def component_row(ours: Separation, baseline: Separation, i: int) -> ComparisonRow:
+    """The paper's Figs. 4 and 6 for basis light i."""
+    return ComparisonRow(
+        light=ours.basis[i],
+        original=ours.highlight_free[i] + ours.specular[i],
+        scattering=ours.scattering[i],
+        local_diffuse=ours.local_diffuse[i],
+        specular=ours.specular[i],
+        baseline_diffuse=baseline.diffuse[i],
+        baseline_specular=baseline.specular[i],
+    )
+
+
+def left_out(
+    ours: Separation,
+    baseline: Separation,
+    capture: Capture,
+    names: Sequence[str],
+    pictures: tuple[Tensor, Tensor] | None,
+) -> list[HeldOut]:
+    """Lights of the capture that the fit was told to leave out."""
+    if pictures is None:
+        return []
+    mixes = alphas_for([capture.lights[name] for name in names], ours.light_vectors)
+    rows = []
+    for i, name in enumerate(names):
+        alpha = torch.tensor(mixes[name].alpha)
+        rows.append(
+            HeldOut(
+                light=name,
+                real=pictures[0][i],
+                ours=ours.relight(alpha),
+                baseline=baseline.relight(alpha),
+                counts=~pictures[1][i].any(0),
+            )
+        )
+    return rows
+
+
+def beside(ours: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:
+    """Lights of `heldout.json`, whose pictures lie beside the capture in its own units."""
+    listed = capture.folder / "heldout.json"
+    if not listed.is_file() or ours.light_vectors is None:
+        return []
+    lights = read_lights(listed)
+    mixes = alphas_for(list(lights.values()), ours.light_vectors)
+    rows = []
+    for name, mix in mixes.items():
+        file = capture.folder / "heldout" / f"{name}.exr"
+        if file.is_file():
+            alpha = torch.tensor(mix.alpha)
+            real, _ = read_picture(file)
+            rows.append(HeldOut(light=name, real=real, ours=ours.relight(alpha), baseline=baseline.relight(alpha)))
+    return rows
+
+
+def truth_lines(ours: Separation, baseline: Separation, capture: Capture) -> list[str]:
+    """Errors of the components where the capture knows its truth."""
+    errors: dict[str, list[float]] = {}
+    for i, name in enumerate(ours.basis):
+        file = capture.folder / "truth" / f"{name}.exr"
+        if not file.is_file():
+            return []
+        planes = read_channels(file)
+        channels = ("Y",) if ours.d.shape[1] == 1 else ("R", "G", "B")
+
+        def truth(layer: str, planes: dict = planes, channels: tuple[str, ...] = channels) -> Tensor | None:
+            keys = [f"{layer}.{c}" for c in channels]
+            return torch.stack([torch.from_numpy(planes[k]).float() for k in keys]) if keys[0] in planes else None
+
+        specular, scattering = truth("specular"), truth("scattering_beyond_1px")
+        if specular is not None:
+            whole = ours.highlight_free[i] + ours.specular[i] - specular
+            for key, picture, real in (
+                ("specular, ours", ours.specular[i], specular),
+                ("specular, Lin & Lee", baseline.specular[i], specular),
+                ("diffuse, ours", ours.diffuse[i], whole),
+                ("diffuse, Lin & Lee", baseline.diffuse[i], whole),
+            ):
+                errors.setdefault(key, []).append(relative_rms(picture, real, ours.mask))
+        if scattering is not None and bool(ours.scattering.any()):
+            errors.setdefault("scattering", []).append(relative_rms(ours.scattering[i], scattering, ours.mask))
+    return [f"  error of {key:22s} {100 * sum(v) / len(v):5.1f} % of the truth" for key, v in errors.items()]

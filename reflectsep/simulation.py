@@ -1,0 +1,56 @@
+"""The simulate job: settings of the command to a simulated object and rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reflectsep.config import RigSettings, SimulateJob
+from reflectsep.progress import Progress
+from reflectsep.synth.paper import PaperObject, paper_rig, simulate_paper
+from reflectsep.synth.presets import make_object
+from reflectsep.synth.rig import SimulatedCamera, SimulatedRig, make_rig
+from reflectsep.synth.simulate import simulate
+
+
+def write(job: SimulateJob, progress: Progress) -> str:
+    """Write the capture of a job; returns a line that says what was written.
+
+    Raises:
+        ResultError: the folder exists and may not be replaced.
+        SettingsError: an object or rig that cannot be.
+    """
+    out = Path(job.out)
+    if job.mode == "paper":
+        obj = PaperObject(name=job.object.name or "paper", size=job.object.size_px, channels=job.object.channels)
+        rig = paper_rig(job.rig.lights, sigma=job.rig.read_noise, sweeps=job.rig.sweeps)
+        simulate_paper(obj, rig, out, seed=job.seed, overwrite=job.overwrite, progress=progress)
+    else:
+        made = make_object(job.object.preset, size=job.object.size_px, channels=job.object.channels)
+        simulate(made, rig_of(job.rig), out, seed=job.seed, overwrite=job.overwrite, progress=progress)
+    return f"{out}: {job.rig.lights} pictures, {job.rig.heldout} held-out lights, truth beside them"
+
+
+def rig_of(settings: RigSettings) -> SimulatedRig:
+    """The simulated rig that the settings describe."""
+    full_well = None
+    if settings.shot_noise > 0:
+        full_well = 1.0 / settings.shot_noise**2
+    camera = SimulatedCamera(
+        full_exposure_s=settings.full_exposure_s,
+        slab_exposure_s=settings.sweep_exposure_s,
+        peak=1.0 / settings.headroom,
+        dark_level=settings.dark_level,
+        read_sigma=settings.read_noise,
+        full_well_e=full_well,
+        bits=settings.bits,
+    )
+    return make_rig(
+        settings.name,
+        lights=settings.lights,
+        basis_tilt_deg=settings.basis_angle_deg,
+        spread_deg=(min(12.0, settings.spread_deg), settings.spread_deg),
+        heldout=(settings.heldout, 1 if settings.heldout else 0),
+        sweeps=(min(settings.sweeps, settings.lights), min(settings.sweeps, settings.lights) if settings.orthogonal else 0),
+        slab_px=(settings.slab_width_px, settings.slab_step_px),
+        camera=camera,
+    )
