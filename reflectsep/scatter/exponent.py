@@ -29,6 +29,8 @@ BINS = 12
 FLOOR = 5e-4
 """Relative error of a bin that is always allowed for: camera and stage are no better."""
 IDENTIFIABLE_SD = 0.02
+UNKNOWN_SD = GRID[-1] - GRID[0]
+"""Standard deviation of an exponent that the data say nothing of: the range that was searched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +86,7 @@ def solve_exponent(samples: list[Samples], exponents: tuple[float, ...]) -> Expo
     gains = [_gain(b, np.log(np.asarray(exponents)), np.log(n_d)) for b in bins]
     return Exponent(
         n_d=float(n_d),
-        n_d_sd=float(sd),
+        n_d_sd=float(min(sd, UNKNOWN_SD)),
         identifiable=identifiable,
         gains=tuple(float(g) for g, _ in gains),
         gains_sd=tuple(float(s) for _, s in gains),

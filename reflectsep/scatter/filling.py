@@ -38,6 +38,9 @@ from reflectsep.scatter.band import Evidence, Profiles
 from reflectsep.scatter.frames import Step
 from reflectsep.scatter.kernel import Slab, fill_by_profile
 
+CALM_STEPS = 0.75
+"""Standard deviation of the smoothing of filled profiles, in steps of the slab."""
+
 Picture = Float[Tensor, "channels height width"]
 Mask = Bool[Tensor, "height width"]
 
@@ -54,6 +57,8 @@ class Setting:
     """The sweep of the same light the other way."""
     partner_gain: float = 1.0
     """C of this sweep over C of the partner."""
+    stretch: Float[Tensor, "height width"] | None = None
+    """Frames that a length along the surface takes, over those across the sheet of light; None: 1 everywhere."""
 
 
 class Filling(Protocol):
@@ -94,8 +99,29 @@ def orthogonal(evidence: Evidence, setting: Setting) -> Picture:
 def profile(evidence: Evidence, setting: Setting) -> Picture:
     """Every pixel's lit frames by its fitted profile."""
     profiles = evidence.profiles()
-    fill = fill_by_profile(profiles, setting.slab, distance_px=setting.distance_px, noise=setting.noise)
-    return evidence.picture(profiles.measured + fill)
+    distance = setting.distance_px
+    if setting.stretch is not None:
+        distance = distance * setting.stretch[evidence.mask]
+    fill = fill_by_profile(profiles, setting.slab, distance_px=distance, noise=setting.noise)
+    return calmed(evidence.picture(profiles.measured + fill), evidence.mask, CALM_STEPS / setting.slab.frames_per_px)
+
+
+def calmed(root: Picture, mask: Mask, sigma_px: float) -> Picture:
+    """Stripes smoothed away, edges kept.
+
+    How near the closest unlit frame comes to a pixel changes with a period of one step of the slab, and what is filled
+    with it: stripes of some per cent. Scattered light is smooth, so a Gaussian of that width removes them; where a
+    pixel is farther from it than three times what is usual there is an edge of the material, and it stays as it is.
+    """
+    reach = 2 * max(1, round(3 * sigma_px)) + 1
+    blur = lambda p: gaussian_blur2d(p[None], (reach, reach), (sigma_px, sigma_px), "constant")[0]  # noqa: E731
+    smooth = blur(root * mask) / blur(mask[None].to(root)).clamp(min=1e-6)
+    away = (root - smooth).abs() / smooth.abs().clamp(min=1e-9)
+    bright = mask & (smooth.mean(0) > 0.05 * smooth.mean(0)[mask].max())
+    if not bright.any():
+        return root
+    usual = 1.4826 * away[:, bright].median()
+    return torch.where((away <= 3.0 * usual) & mask, smooth, root)
 
 
 FILLINGS: dict[str, Filling] = {

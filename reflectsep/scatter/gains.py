@@ -10,7 +10,7 @@ from kornia.filters import box_blur
 from torch import Tensor
 
 from reflectsep.data import PhotometricStack
-from reflectsep.scatter.exponent import GRID, Exponent, Samples, complete, solve_exponent
+from reflectsep.scatter.exponent import GRID, UNKNOWN_SD, Exponent, Samples, complete, solve_exponent
 from reflectsep.scatter.frames import name_of
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage
@@ -103,7 +103,7 @@ def _exponent(found: Exponent | None, options: ScatterOptions, warnings: list[st
     if found is None or not found.identifiable:
         why = "no pixel is fit for Eq. 25" if found is None else f"its standard deviation would be {found.n_d_sd:.2g}"
         warnings.append(f"n_d cannot be told from the sweeps ({why}), as on an opaque object: 1 is taken")
-        return 1.0, float("inf"), "unidentifiable"
+        return 1.0, UNKNOWN_SD if found is None else found.n_d_sd, "unidentifiable"
     return found.n_d, found.n_d_sd, "estimated"
 
 

@@ -58,8 +58,10 @@ def scales(slab: Slab) -> Float[Tensor, "scales"]:
     return SMALLEST_SCALE * 2.0 ** torch.arange(count, dtype=torch.float32)
 
 
-def beyond(distance: float, s: Float[Tensor, "scales"]) -> Float[Tensor, "scales"]:
+def beyond(distance: float | Float[Tensor, "pixels"], s: Float[Tensor, "scales"]) -> Float[Tensor, "scales *pixels"]:
     """Part (d/s) K_1(d/s) of the light of a K_0 spread that leaves farther than d from where it entered."""
+    if isinstance(distance, Tensor):
+        s = s[:, None]
     x = (distance / s).clamp(min=1e-6)
     return x * torch.special.modified_bessel_k1(x)
 
@@ -90,33 +92,36 @@ def nonnegative_least_squares(
 
 
 def fill_by_profile(
-    profiles: Profiles, slab: Slab, *, distance_px: float, noise: float
+    profiles: Profiles, slab: Slab, *, distance_px: float | Float[Tensor, "pixels"], noise: float
 ) -> Float[Tensor, "channels pixels"]:
     """What the scattering added in the holes, less what left nearer than `distance_px` from where it entered.
 
     Args:
         profiles: root frames around each pixel's passage.
         slab: its geometry.
-        distance_px: pixels of the picture.
+        distance_px: pixels across the sheet of light, one for all or one a pixel.
         noise: standard deviation of a root frame.
     """
     channels, pixels = profiles.root.shape[1:]
     result = torch.zeros((channels, pixels))
     for start in range(0, pixels, CHUNK):
-        part = profiles.part(slice(start, start + CHUNK))
+        cut = slice(start, start + CHUNK)
+        part = profiles.part(cut)
+        distance = distance_px[cut] if isinstance(distance_px, Tensor) else distance_px
         for c in range(channels):
-            result[c, start : start + CHUNK] = _fill(part, c, slab, distance_px, noise)
+            result[c, cut] = _fill(part, c, slab, distance, noise)
     return result
 
 
-def _fill(profiles: Profiles, channel: int, slab: Slab, distance_px: float, noise: float) -> Tensor:
+def _fill(profiles: Profiles, channel: int, slab: Slab, distance_px: float | Tensor, noise: float) -> Tensor:
     value, u = profiles.root[:, channel], profiles.offset
     clipped = profiles.saturated[:, channel]
     s = scales(slab)
     measured = profiles.present & ~profiles.hole & ~clipped
     plateau = profiles.present & profiles.hole & ~clipped & (u.abs() <= slab.half - slab.edge)
     response = line_response(u, slab.half, s) * profiles.light[:, None]
-    far = beyond(distance_px * slab.frames_per_px, s).repeat(2)
+    far = beyond(distance_px * slab.frames_per_px, s)
+    far = torch.cat([far, far]).reshape(2 * len(s), -1)
     columns = torch.cat([response, plateau[:, None, :].to(value)], 1)
     weight, size = _weights(value, measured, plateau, noise)
     weighted = columns * weight[:, None]
@@ -144,5 +149,5 @@ def _beyond_in_holes(
     bounded = profiles.present & ~clipped
     filled = torch.where(bounded, torch.minimum(model, value.clamp(min=0.0)), model)
     kept = filled.sum(0) / model.sum(0).clamp(min=1e-20)
-    near = 2.0 * slab.half * (amplitude * (1.0 - far)[:, None]).sum(0)
+    near = 2.0 * slab.half * (amplitude * (1.0 - far)).sum(0)
     return filled.sum(0) - kept.clamp(max=1.0) * near * profiles.lit

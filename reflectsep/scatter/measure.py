@@ -26,6 +26,7 @@ from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
 from reflectsep.scatter.gains import Gains, choose_samples, exponents, solve_gains
 from reflectsep.scatter.kernel import Slab
+from reflectsep.scatter.geometry import crude_normals, surface_stretch
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage, speed_deviation, watch
 
@@ -86,7 +87,10 @@ def measure_scattering(
     gains = solve_gains(stack, lights, passages, chosen, options)
     prepared = _prepare(stack, sweeps, lights, passages, gains, options, progress)
     warnings = list(gains.warnings) + _warn(prepared, options)
-    sums = torch.stack([_root_sum(p, prepared, gains.n_d, options) / p.gain for p in prepared])
+    normals = crude_normals(stack)
+    sums = torch.stack(
+        [_root_sum(p, prepared, gains.n_d, options, _stretch(stack, normals, p)) / p.gain for p in prepared]
+    )
     noise = torch.stack([_root_sd(p, gains.n_d) for p in prepared])
     root, root_sd, measured = _combine(stack, lights, sums, noise)
     return Scattering(
@@ -254,7 +258,15 @@ def _partner(p: _Prepared, prepared: list[_Prepared]) -> _Prepared | None:
     return None
 
 
-def _root_sum(p: _Prepared, prepared: list[_Prepared], n_d: float, options: ScatterOptions) -> Tensor:
+def _stretch(stack: PhotometricStack, normals: Tensor | None, p: _Prepared) -> Tensor | None:
+    if normals is None or stack.light_vectors is None:
+        return None
+    return surface_stretch(normals, stack.light_vectors[p.light], p.evidence.stream.sweep.direction)
+
+
+def _root_sum(
+    p: _Prepared, prepared: list[_Prepared], n_d: float, options: ScatterOptions, stretch: Tensor | None
+) -> Tensor:
     other = _partner(p, prepared) if options.hole_filling == "orthogonal" else None
     setting = Setting(
         slab=p.slab,
@@ -262,6 +274,7 @@ def _root_sum(p: _Prepared, prepared: list[_Prepared], n_d: float, options: Scat
         noise=_root_noise(p, n_d),
         partner=None if other is None else other.evidence,
         partner_gain=1.0 if other is None else p.gain / other.gain,
+        stretch=stretch,
     )
     return FILLINGS[options.hole_filling](p.evidence, setting) * p.evidence.mask
 
