@@ -25,6 +25,9 @@ from reflectsep.solve.problem import BlockProblem
 SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haze", "log_n_d")
 LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
 
+MOST_LOG_N_S = 5.3
+"""log of 200: a sharper lobe is a mirror image, of which a handful of directional lights sees single pixels."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Observations:
@@ -205,6 +208,7 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             *((C_1 / mean - 1.0) / priors.common_sd),
             (shared[LOG_C_2] - log_C_1 - torch.log(shared.new_tensor(2.0))) / priors.mirror_sd,
             excess.clamp_min(0.0) / priors.height_sd,
+            (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.height_sd,
             shared[SOFTNESS] / priors.softness_sd,
             shared[ROOT_HAZE] / priors.haze_sd,
         ]

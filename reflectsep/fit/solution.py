@@ -42,6 +42,8 @@ class Effort:
     """Share of the chosen pixels that has a vote on the globals: those that the model explains best."""
     trim_all: float = 0.97
     """The same when all pixels are fitted."""
+    voters: int = 30_000
+    """Pixels that vote at most: the globals of more are known no better, and the others follow them."""
     rounds: int = 4
     starts: int = 3
     chunk: int = 1 << 15
@@ -157,7 +159,8 @@ def fit_everything(
 ) -> JointSolution:
     """Globals and all pixels jointly; pixels that the model cannot explain follow without a vote."""
     number = max(4, int(effort.trim_all * len(obs)))
-    vote = found.cost.argsort()[:number]
+    vote = found.cost.argsort()[:number].sort().values
+    vote = vote[:: max(1, -(-len(vote) // effort.voters))]
     problem = build_problem(obs, priors, robust=robust)
     total = effort.joint.max_iterations
     joint = solve_joint(

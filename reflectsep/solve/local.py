@@ -79,7 +79,7 @@ def solve_local(
     iteration = 0
     for iteration in range(1, termination.max_iterations + 1):
         here, mu_here, cost_here = local[active], mu[active], cost[active]
-        r, J, _ = part.linearise(here, shared)
+        r, J = part.linearise_local(here, shared)
         V, gradient = normal_equations(r, J, robust_weight(r, part.threshold))
         step = solve_damped(V, gradient, mu_here)
         predicted = -(gradient * step).sum(-1) - 0.5 * (step * (V @ step[..., None])[..., 0]).sum(-1)

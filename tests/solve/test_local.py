@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from reflectsep.solve.local import Termination, normal_equations, solve_damped, solve_local
+from reflectsep.solve.problem import BlockProblem
+
+
+def decay(local, shared, x, y):
+    """p0 exp(-p1 x) + g - y."""
+    return local[..., :1] * torch.exp(-local[..., 1:2] * x) + shared[0] - y
+
+
+def decays(blocks=60, dtype=torch.float64, threshold=None):
+    g = torch.Generator().manual_seed(1)
+    truth = torch.rand(blocks, 2, generator=g, dtype=dtype) * 2 + 0.5
+    shared = torch.tensor([0.3], dtype=dtype)
+    x = torch.linspace(0, 3, 9, dtype=dtype).expand(blocks, 9).contiguous()
+    y = decay(truth, shared, x, torch.zeros_like(x))
+    start = torch.ones(blocks, 2, dtype=dtype)
+    return BlockProblem(residual=decay, data=(x, y), threshold=threshold), start, shared, truth
+
+
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-6), (torch.float32, 1e-3)])
+def test_exponentials_are_recovered(dtype, close):
+    problem, start, shared, truth = decays(dtype=dtype)
+    found = solve_local(problem, start, shared)
+    assert found.converged.all()
+    assert float((found.local - truth).abs().max()) < close
+    torch.testing.assert_close(found.cost, problem.costs(found.local, shared))
+
+
+def test_out_of_iterations_is_not_called_converged():
+    problem, start, shared, truth = decays()
+    start[:10] = truth[:10]
+    found = solve_local(problem, start, shared, Termination(max_iterations=1))
+    assert found.iterations == 1
+    assert found.converged[:10].all()
+    assert not found.converged[10:].any()
+
+
+def test_the_start_is_left_alone_and_the_cost_never_rises():
+    problem, start, shared, _ = decays()
+    kept = start.clone()
+    costs = [problem.costs(start, shared)]
+    costs += [solve_local(problem, start, shared, Termination(max_iterations=n)).cost for n in (1, 2, 4, 8)]
+    assert torch.equal(start, kept)
+    for before, after in zip(costs, costs[1:], strict=False):
+        assert (after <= before).all()
+
+
+def test_a_block_depends_neither_on_the_others_nor_on_their_order():
+    problem, start, shared, _ = decays()
+    whole = solve_local(problem, start, shared)
+    for index in (torch.tensor([17]), torch.tensor([3, 50]), torch.arange(59, -1, -1), torch.arange(5, 42)):
+        part = solve_local(problem.take(index), start[index], shared)
+        assert torch.equal(part.local, whole.local[index])
+        assert torch.equal(part.cost, whole.cost[index])
+        assert torch.equal(part.converged, whole.converged[index])
+
+
+def test_a_block_that_is_no_number_does_not_spoil_the_others():
+    problem, start, shared, truth = decays()
+    x, y = problem.data
+    y = y.clone()
+    y[4] = torch.nan
+    broken = BlockProblem(residual=decay, data=(x, y))
+    found = solve_local(broken, start, shared)
+    others = torch.arange(60) != 4
+    assert float((found.local - truth)[others].abs().max()) < 1e-6
+    assert found.local.isfinite().all()
+
+
+def test_an_outlier_is_weighed_down():
+    threshold = torch.full((9,), 0.05, dtype=torch.float64)
+    problem, start, shared, truth = decays(threshold=threshold)
+    x, y = problem.data
+    y = y.clone()
+    y[:, 4] += 1.0
+    plain = solve_local(BlockProblem(residual=decay, data=(x, y)), start, shared)
+    robust = solve_local(BlockProblem(residual=decay, data=(x, y), threshold=threshold), start, shared)
+    far = lambda found: float((found.local - truth).abs().median())  # noqa: E731
+    assert far(robust) < 0.25 * far(plain)
+
+
+def test_the_damped_step_solves_its_equations():
+    g = torch.Generator().manual_seed(2)
+    J = torch.randn(6, 8, 3, generator=g, dtype=torch.float64) * torch.tensor([1.0, 1e-4, 1e3], dtype=torch.float64)
+    r = torch.randn(6, 8, generator=g, dtype=torch.float64)
+    weight = torch.rand(6, 8, generator=g, dtype=torch.float64)
+    mu = torch.logspace(-6, 2, 6, dtype=torch.float64)
+    V, gradient = normal_equations(r, J, weight)
+    step = solve_damped(V, gradient, mu)
+    for p in range(6):
+        w = torch.diag(weight[p])
+        dense = J[p].T @ w @ J[p]
+        torch.testing.assert_close(V[p], dense)
+        system = dense + mu[p] * torch.diag(dense.diagonal())
+        # In the parameters' own units the dense system is too badly conditioned to solve as it stands.
+        unit = torch.diag(dense.diagonal().rsqrt())
+        expected = -unit @ torch.linalg.solve(unit @ system @ unit, unit @ J[p].T @ w @ r[p])
+        torch.testing.assert_close(step[p], expected, rtol=1e-9, atol=0)
+
+
+def test_a_parameter_that_nothing_feels_stays_where_it_is():
+    V = torch.tensor([[[2.0, 0.0], [0.0, 0.0]]], dtype=torch.float64)
+    step = solve_damped(V, torch.tensor([[1.0, 0.0]], dtype=torch.float64), torch.tensor([1e-3], dtype=torch.float64))
+    assert step[0, 1] == 0.0
+    torch.testing.assert_close(step[0, 0], torch.tensor(-0.5 / 1.001, dtype=torch.float64))
