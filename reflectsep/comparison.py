@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from reflectsep.data import Capture
+from reflectsep.errors import CaptureError
 from reflectsep.io.exr import read_channels
 from reflectsep.io.lights import read_lights
 from reflectsep.io.pictures import read_picture
-from reflectsep.relight import alphas_for
+from reflectsep.relight import LightMix, alphas_for
 from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
 from reflectsep.report.metrics import psnr, relative_rms
 from reflectsep.separation import Separation
@@ -68,16 +69,7 @@ def left_out(
     mixes = alphas_for([capture.lights[name] for name in names], ours.light_vectors)
     rows = []
     for i, name in enumerate(names):
-        alpha = torch.tensor(mixes[name].alpha)
-        rows.append(
-            HeldOut(
-                light=name,
-                real=pictures[0][i],
-                ours=ours.relight(alpha),
-                baseline=baseline.relight(alpha),
-                counts=~pictures[1][i].any(0),
-            )
-        )
+        rows.append(held_out(name, pictures[0][i], ours, baseline, mixes[name], counts=~pictures[1][i].any(0)))
     return rows
 
 
@@ -92,10 +84,31 @@ def beside(ours: Separation, baseline: Separation, capture: Capture) -> list[Hel
     for name, mix in mixes.items():
         file = capture.folder / "heldout" / f"{name}.exr"
         if file.is_file():
-            alpha = torch.tensor(mix.alpha)
             real, _ = read_picture(file)
-            rows.append(HeldOut(light=name, real=real, ours=ours.relight(alpha), baseline=baseline.relight(alpha)))
+            if real.shape != ours.d.shape[1:]:
+                raise CaptureError(f"{file}: {tuple(real.shape)}, but the result is {tuple(ours.d.shape[1:])}")
+            rows.append(held_out(name, real, ours, baseline, mix, counts=real.isfinite().all(0)))
     return rows
+
+
+def held_out(
+    name: str, real: Tensor, ours: Separation, baseline: Separation, mix: LightMix, *, counts: Tensor
+) -> HeldOut:
+    """One light's real picture (channels, height, width) and the two models' under it; `counts` (height, width)."""
+    alpha = torch.tensor(mix.alpha)
+    return HeldOut(
+        light=name,
+        real=torch.where(counts, real, 0.0),
+        ours=bounded(ours.relight(alpha), real),
+        baseline=bounded(baseline.relight(alpha), real),
+        counts=counts,
+    )
+
+
+def bounded(picture: Tensor, real: Tensor) -> Tensor:
+    """`picture` with what is beyond 100 times the brightest real value (a lobe that overflows, say) set to that."""
+    most = 100.0 * float(real.nan_to_num(nan=0.0, posinf=0.0).amax().clamp_min(1e-6))
+    return picture.nan_to_num(nan=most, posinf=most).clamp(-most, most)
 
 
 def truth_lines(ours: Separation, baseline: Separation, capture: Capture) -> list[str]:

@@ -42,7 +42,12 @@ class RigSettings:
     lights: int = setting(6, "full pictures, the three basis lights included", at_least=3, at_most=500)
     basis_angle_deg: float = setting(25.0, "angle of the basis lights off the view", above=0.0, at_most=85.0)
     spread_deg: float = setting(30.0, "largest angle of the other lights off the view", above=0.0, at_most=85.0)
-    heldout: int = setting(3, "more lights inside the cone of the basis, kept out of the capture", at_least=0, at_most=100)
+    heldout: int = setting(
+        3,
+        "lights to relight, inside the cone of the basis; one more lies outside",
+        at_least=0,
+        at_most=100,
+    )
     sweeps: int = setting(3, "lights that are swept with a slab, the basis first; 0: none", at_least=0)
     orthogonal: bool = setting(False, "sweep each of them along y as well as along x")
     slab_width_px: float = setting(4.0, "width of the slab", above=0.0)
@@ -77,7 +82,9 @@ class FitSettings:
         0.03, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
     )
     robust: Literal["huber", "none"] = setting("huber", "loss that weighs cast shadows down")
-    lobe: Literal["auto", "single"] = setting("auto", "haze and soft shadow edges where they pay, or the paper's formula")
+    lobe: Literal["auto", "haze", "single"] = setting(
+        "auto", "soft shadow edges where they pay; a haze besides; or the paper's formula alone"
+    )
     max_iterations: int = setting(20, "limit of every joint solve", at_least=1)
     tolerance: float = setting(
         1e-6, "relative change of the cost that ends a pixel's iterations", above=0.0, at_most=1.0
@@ -186,6 +193,7 @@ class CompareJob:
 
     key: ClassVar[str] = ""
     result: str = required("result folder to compare", path=True)
+    capture: str | None = setting(None, "its capture; null: the folder that the result names", path=True)
     out: str = setting("compare.png", "figure to write (.png)", path=True)
     overwrite: bool = setting(False, "replace what is there")
 

@@ -43,17 +43,15 @@ def decode(value: int) -> list[str]:
     Raises:
         ValueError: `value` has a bit that no flag names.
     """
-    return [flag.name for flag in Flag if flag & Flag(value)]
+    return [str(flag.name) for flag in Flag if flag & Flag(value)]
 
 
 def count(flags: Int[Tensor, "height width"]) -> dict[str, int]:
     """Number of pixels that carry each flag, every flag named, absent ones as 0."""
     bits = flags.detach().cpu().to(torch.int64).numpy()
-    return {flag.name: int(np.count_nonzero(bits & flag.value)) for flag in Flag}
+    return {str(flag.name): int(np.count_nonzero(bits & flag.value)) for flag in Flag}
 
 
-def mark(
-    flags: Int[Tensor, "height width"], where: Tensor, flag: Flag
-) -> Int[Tensor, "height width"]:
+def mark(flags: Int[Tensor, "height width"], where: Tensor, flag: Flag) -> Int[Tensor, "height width"]:
     """`flags` with `flag` added at the true pixels of `where` (height, width)."""
     return torch.where(where, flags | int(flag), flags)

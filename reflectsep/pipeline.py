@@ -1,35 +1,39 @@
 """The order of the stages, and the jobs of the command line.
 
-    load -> calibrate (stack, alpha) -> scatter (n_d, C, s) -> fit -> separate -> save
+load -> calibrate (stack, alpha) -> scatter (n_d, C, s) -> fit -> separate -> save
 """
 
 from __future__ import annotations
 
 import dataclasses
-import platform
 import time
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from reflectsep import __version__, simulation
-from reflectsep.calibrate.alpha import AlphaReport
-from reflectsep.calibrate.exposure import developed_stream, missing_darks, response_of
+from reflectsep import simulation
+from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, held_out_pictures, without
 from reflectsep.comparison import compare_result
-from reflectsep.config import CompareJob, DemoJob, FitJob, FitSettings, InfoJob, RelightJob, ScatterSettings, SimulateJob
-from reflectsep.data import Capture, Fit, Light, PhotometricStack, Scattering
+from reflectsep.config import (
+    CompareJob,
+    DemoJob,
+    FitJob,
+    FitSettings,
+    InfoJob,
+    RelightJob,
+    ScatterSettings,
+    SimulateJob,
+)
+from reflectsep.data import Capture, Light, PhotometricStack, Scattering
 from reflectsep.errors import ResultError, SettingsError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
-from reflectsep.flags import count
 from reflectsep.io.capture import load_capture
-from reflectsep.io.files import refuse_existing
+from reflectsep.io.files import refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
 from reflectsep.progress import Progress, silent
@@ -38,6 +42,8 @@ from reflectsep.report.tone import tone, white_point
 from reflectsep.scatter.measure import measure_scattering
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.separation import Separation, load, separate
+from reflectsep.settings import nearest
+from reflectsep.summary import capture_summary, describe, summary
 
 __all__ = ["fit", "load", "load_capture"]
 
@@ -49,6 +55,7 @@ def fit(
     scatter: ScatterSettings | None = None,
     heldout: Sequence[str] = (),
     progress: Progress = silent,
+    **changes: Any,
 ) -> Separation:
     """Separate a capture: the whole method, from files to components.
 
@@ -58,6 +65,7 @@ def fit(
         scatter: of the sweeps; the defaults where None.
         heldout: lights to leave out, to compare with later.
         progress: called as (stage, done, total).
+        **changes: single settings of the fit by name, as in `fit(capture, scattering="none")`.
 
     Returns:
         The separation; `separation.save(folder)` writes it.
@@ -65,7 +73,7 @@ def fit(
     Raises:
         ReflectsepError: whatever makes the capture unfit, in one line that names the file.
     """
-    settings, scatter = settings or FitSettings(), scatter or ScatterSettings()
+    settings, scatter = changed(settings or FitSettings(), changes), scatter or ScatterSettings()
     clock = Clock()
     capture = without(capture, heldout)
     least = 8 if settings.scattering == "unknown" else 6
@@ -77,8 +85,30 @@ def fit(
     clock.lap("scattering")
     fitted = fit_reflectance(stack, scattering, fit_options(settings), progress=progress)
     clock.lap("fit")
-    document = describe(capture, stack, lights, scattering, fitted, clock, settings, scatter, heldout)
+    document = describe(
+        capture,
+        stack,
+        lights,
+        scattering,
+        fitted,
+        timings_s=clock.seconds,
+        settings={"fit": dataclasses.asdict(settings), "scatter": dataclasses.asdict(scatter)},
+        heldout=heldout,
+    )
     return separate(stack, scattering, fitted, document)
+
+
+def changed(settings: FitSettings, changes: Mapping[str, Any]) -> FitSettings:
+    """`settings` with some of them changed, and checked.
+
+    Raises:
+        SettingsError: no such setting, or an impossible value.
+    """
+    known = [f.name for f in dataclasses.fields(settings)]
+    for name in changes:
+        if name not in known:
+            raise SettingsError(f"{settings.key}{name}: no such setting{nearest(name, known)}")
+    return dataclasses.replace(settings, **changes)
 
 
 def measure(
@@ -116,64 +146,6 @@ class Clock:
         self._last = now
 
 
-def describe(  # noqa: PLR0913  (it gathers from every stage)
-    capture: Capture,
-    stack: PhotometricStack,
-    lights: AlphaReport,
-    scattering: Scattering | None,
-    fitted: Fit,
-    clock: Clock,
-    settings: FitSettings,
-    scatter: ScatterSettings,
-    heldout: Sequence[str],
-) -> dict[str, Any]:
-    """What `separation.json` says beside the globals."""
-    residual = fitted.residual[..., stack.mask]
-    warnings = [*lights.warnings, *missing_darks(capture), *fitted.warnings]
-    model = "Wu & Tang: off-specular, local diffuse and scattering"
-    if scattering is None:
-        model = "Lin & Lee: off-specular and diffuse, scattering taken as zero"
-        if settings.scattering == "unknown":
-            model = "Wu & Tang with scattering unknown: not identifiable where no highlight is seen"
-        elif settings.scattering == "measured":
-            warnings.append("the capture has no sweeps: scattering is taken as zero (the model of Lin & Lee)")
-    document: dict[str, Any] = {
-        "object": capture.object,
-        "capture": str(capture.folder.resolve()),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "model": model,
-        "heldout": list(heldout),
-        "n_d_source": "assumed" if scattering is None else scattering.n_d_source,
-        "covariance": {"order": list(fitted.global_names), "values": fitted.covariance.tolist()},
-        "alpha_source": dict(zip(lights.names, lights.source, strict=True)),
-        "alpha_agreement": [dataclasses.asdict(a) for a in lights.agreement],
-        "noise": fitted.noise,
-        "cost": fitted.cost,
-        "iterations": fitted.iterations,
-        "residual": {
-            "rms": float(residual.square().mean().sqrt()),
-            "rms_by_light": {n: float(residual[i].square().mean().sqrt()) for i, n in enumerate(stack.names)},
-            "largest": float(residual.abs().amax()),
-        },
-        "settings": {"fit": dataclasses.asdict(settings), "scatter": dataclasses.asdict(scatter)},
-        "versions": {
-            "reflectsep": __version__,
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
-        "timings_s": clock.seconds,
-    }
-    if scattering is not None:
-        warnings.extend(scattering.warnings)
-        document["n_d_sd"] = scattering.n_d_sd
-        document["sweeps"] = [dataclasses.asdict(report) for report in scattering.sweeps]
-    if fitted.haze > 0 or fitted.softness > 0:
-        document["extensions"] = "haze and soft shadow edges lowered the cost and were kept"
-    document["warnings"] = warnings
-    return document
-
-
 def previews(separation: Separation) -> dict[str, Tensor]:
     """Pictures for a quick look, encoded for a screen, every component of a light with a stated white point."""
     shown: dict[str, Tensor] = {}
@@ -195,24 +167,25 @@ def run_simulate(job: SimulateJob, progress: Progress = silent) -> str:
 
 def run_fit(job: FitJob, progress: Progress = silent) -> str:
     """Separate a capture into a result folder."""
-    refuse_existing(Path(job.out), job.overwrite)
+    refuse_folder(job.out, job.overwrite)
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
     separation = fit(
         capture, settings=job.fit, scatter=job.scatter, heldout=tuple(job.heldout or ()), progress=progress
     )
+    if job.lights_file is not None:
+        document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}
+        separation = dataclasses.replace(separation, document=document)
     separation.save(job.out, overwrite=job.overwrite, previews=previews(separation))
     return f"{job.out}: {summary(separation)}"
 
 
 def run_relight(job: RelightJob, progress: Progress = silent) -> str:
     """Write pictures under other lights."""
-    refuse_existing(Path(job.out), job.overwrite)
+    refuse_folder(job.out, job.overwrite)
     separation = load(job.result)
-    files = relight_to_folder(
-        separation, mixes(job, separation), job.out, overwrite=job.overwrite, progress=progress
-    )
+    files = relight_to_folder(separation, mixes(job, separation), job.out, overwrite=job.overwrite, progress=progress)
     return f"{job.out}: {len(files)} picture{'s' if len(files) > 1 else ''}"
 
 
@@ -239,11 +212,17 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     """Draw a result beside Lin & Lee's and, for held-out lights, beside the real pictures."""
     refuse_existing(Path(job.out), job.overwrite)
     separation = load(job.result)
-    capture = load_capture(recorded_capture(separation, job.result), basis=separation.basis)
+    folder = recorded_capture(separation, job.result) if job.capture is None else Path(job.capture)
+    lights_file = separation.document.get("lights_file")
+    capture = load_capture(folder, basis=separation.basis, lights_file=lights_file)
     heldout = [str(name) for name in separation.document.get("heldout", [])]
-    settings = FitSettings(**{**separation.document["settings"]["fit"], "scattering": "none"})
-    progress("baseline", 0, 1)
-    baseline = fit(capture, settings=settings, heldout=heldout, progress=progress)
+    baseline = fit(
+        capture,
+        settings=recorded_settings(separation, job.result),
+        heldout=heldout,
+        progress=progress,
+        scattering="none",
+    )
     pictures = held_out_pictures(capture, heldout) if heldout else None
     return compare_result(separation, baseline, capture, heldout, pictures, Path(job.out))
 
@@ -254,10 +233,22 @@ def recorded_capture(separation: Separation, result: str) -> Path:
     Raises:
         ResultError: the result does not say, or the folder is gone.
     """
-    folder = Path(str(separation.document.get("capture", "")))
-    if not folder.is_dir():
-        raise ResultError(f"{result}: its capture {str(folder)!r} is not there; comparing needs the pictures")
-    return folder
+    named = separation.document.get("capture")
+    if not named or not Path(str(named)).is_dir():
+        raise ResultError(f"{result}: its capture {str(named)!r} is not there; give capture=FOLDER to compare with")
+    return Path(str(named))
+
+
+def recorded_settings(separation: Separation, result: str) -> FitSettings:
+    """The fit's settings that a result names.
+
+    Raises:
+        ResultError: it names none, or none that can be.
+    """
+    try:
+        return FitSettings(**separation.document["settings"]["fit"])
+    except (KeyError, TypeError, SettingsError) as error:
+        raise ResultError(f"{result}: separation.json has no usable settings.fit ({error})") from error
 
 
 def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001  (all jobs are called alike)
@@ -265,42 +256,7 @@ def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001 
     path = Path(job.path)
     if (path / "separation.json").is_file():
         return summary(load(path), full=True)
-    capture = load_capture(path)
-    lines = [f"capture of {capture.object} in {capture.folder}"]
-    if capture.size is not None:
-        lines.append(f"  size      {capture.size[0]} x {capture.size[1]}")
-    known = sum(capture.lights[name].direction is not None for name in capture.names)
-    lines.append(f"  pictures  {len(capture.names)} ({known} with a known light direction)")
-    lines.append(f"  basis     {', '.join(capture.basis)}")
-    lines.append(f"  encoding  {capture.encoding.kind}")
-    for sweep in capture.sweeps:
-        lost = f", {len(sweep.lost)} lost" if sweep.lost else ""
-        lines.append(f"  sweep     {sweep.light} along {sweep.direction}: {sweep.count} frames{lost}, {sweep.kind}")
-    if not capture.sweeps:
-        lines.append("  sweeps    none: a fit of it is the model of Lin & Lee")
-    return "\n".join(lines)
-
-
-def summary(separation: Separation, *, full: bool = False) -> str:
-    """A result in a few lines."""
-    document = separation.document
-    globals_ = f"n_s {float(separation.n_s):.2f}, n_d {float(separation.n_d):.4f}"
-    a = ", ".join(f"{v:.3f}" for v in separation.a.tolist())
-    rms = document.get("residual", {}).get("rms", float("nan"))
-    lines = [f"{document.get('model', '')}; a = ({a}), {globals_}, residual {rms:.2g} rms"]
-    lines += [f"  warning: {text}" for text in document.get("warnings", [])]
-    if full:
-        lines.insert(0, f"result of {document.get('object', '?')} from {document.get('capture', '?')}")
-        lines.append(f"  lights    {', '.join(separation.names)}; basis {', '.join(separation.basis)}")
-        height, width = separation.mask.shape
-        lines.append(f"  size      {width} x {height}, {int(separation.mask.sum())} pixels on the object")
-        for sweep in document.get("sweeps", []):
-            lines.append(
-                f"  sweep     {sweep['light']} along {sweep['direction']}: C {sweep['gain']:.4f} +- {sweep['gain_sd']:.2g}"
-            )
-        lines += [f"  {flag.lower():18s}{number}" for flag, number in count(separation.flags).items() if number]
-        lines.append(f"  time      {sum(document.get('timings_s', {}).values()):.1f} s")
-    return "\n".join(lines)
+    return capture_summary(load_capture(path))
 
 
 def run_demo(job: DemoJob, progress: Progress = silent) -> str:
@@ -312,7 +268,13 @@ def run_demo(job: DemoJob, progress: Progress = silent) -> str:
     run_simulate(SimulateJob(object=job.object, rig=job.rig, out=captured, overwrite=again), progress)
     said = run_fit(
         FitJob(
-            object=job.object, rig=job.rig, fit=job.fit, scatter=job.scatter, capture=captured, out=result, overwrite=again
+            object=job.object,
+            rig=job.rig,
+            fit=job.fit,
+            scatter=job.scatter,
+            capture=captured,
+            out=result,
+            overwrite=again,
         ),
         progress,
     )
@@ -321,4 +283,3 @@ def run_demo(job: DemoJob, progress: Progress = silent) -> str:
     figure = str(out / "compare.png")
     compared = run_compare(CompareJob(result=result, out=figure, overwrite=again), progress)
     return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}"
-

@@ -31,22 +31,28 @@ class Lines:
         self._stream = stream
         self._prefix = prefix
         self._stage: str | None = None
-        self._started_s = 0.0
+        self._ended: str | None = None
+        self._started_s = self._ended_s = time.monotonic()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Take note of a step; write the line of a stage that ended."""
+        if done >= total and stage == self._ended:
+            return  # an iteration that reached its limit says so once as a step and once as its end
         if stage != self._stage:
             self.close()
-            self._stage, self._started_s = stage, time.monotonic()
+            # A first report that comes after steps is of a stage that began where the one before ended.
+            self._stage, self._started_s = stage, self._ended_s if done else time.monotonic()
+            self._ended = None
         if done >= total:
             self.close()
 
     def close(self) -> None:
         """Write the line of the stage under way: an iteration that converged early ends before its total."""
         if self._stage is not None:
-            elapsed_s = time.monotonic() - self._started_s
+            self._ended_s = time.monotonic()
+            elapsed_s = self._ended_s - self._started_s
             print(f"{self._prefix}{self._stage}: {elapsed_s:.1f} s", file=self._stream, flush=True)
-            self._stage = None
+            self._ended, self._stage = self._stage, None
 
 
 @contextmanager
@@ -73,6 +79,8 @@ def bars(stream: TextIO) -> Iterator[Progress]:
                     display.update(task, total=display.tasks[task].completed)
             if stage not in tasks:
                 tasks[stage] = display.add_task(stage, total=total)
+            elif done < total and display.tasks[tasks[stage]].finished:
+                display.reset(tasks[stage])  # a stage that is done again
             display.update(tasks[stage], completed=done, total=total)
 
         yield show

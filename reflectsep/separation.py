@@ -217,14 +217,14 @@ def with_components(separation: Separation, stack: PhotometricStack, measured: T
     u = lobe_argument(d, B, separation.a, torch.eye(3)).permute(2, 0, 1)[:, None]
     specular = (t * lobe(u, separation.n_s, separation.haze) * stack.mask).expand_as(separation.d)
     diffuse = separation.relight(torch.eye(3)) - specular
-    clipped = stack.saturated[:3] | ~stack.images[:3].isfinite()
+    unknown = stack.saturated[:3] | ~stack.images[:3].isfinite() | ~stack.mask
     return replace(
         separation,
         specular=specular.contiguous(),
         local_diffuse=t * positive_power(separation.d, separation.n_d),
         scattering=t * positive_power(measured, separation.n_d) * stack.mask,
         diffuse=diffuse,
-        highlight_free=torch.where(clipped, diffuse, stack.images[:3].float() - specular),
+        highlight_free=torch.where(unknown, diffuse, stack.images[:3].float() - specular),
     )
 
 

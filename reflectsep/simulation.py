@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from reflectsep.config import RigSettings, SimulateJob
+from reflectsep.errors import SettingsError
+from reflectsep.io.files import refuse_folder
 from reflectsep.progress import Progress
 from reflectsep.synth.paper import PaperObject, paper_rig, simulate_paper
 from reflectsep.synth.presets import make_object
@@ -20,14 +22,18 @@ def write(job: SimulateJob, progress: Progress) -> str:
         SettingsError: an object or rig that cannot be.
     """
     out = Path(job.out)
+    refuse_folder(out, job.overwrite)
+    if job.rig.sweeps > job.rig.lights:
+        raise SettingsError(f"rig.sweeps={job.rig.sweeps}: must be at most rig.lights={job.rig.lights}")
     if job.mode == "paper":
         obj = PaperObject(name=job.object.name or "paper", size=job.object.size_px, channels=job.object.channels)
-        rig = paper_rig(job.rig.lights, sigma=job.rig.read_noise, sweeps=job.rig.sweeps)
+        rig: SimulatedRig = paper_rig(job.rig.lights, sigma=job.rig.read_noise, sweeps=job.rig.sweeps)
         simulate_paper(obj, rig, out, seed=job.seed, overwrite=job.overwrite, progress=progress)
     else:
         made = make_object(job.object.preset, size=job.object.size_px, channels=job.object.channels)
-        simulate(made, rig_of(job.rig), out, seed=job.seed, overwrite=job.overwrite, progress=progress)
-    return f"{out}: {job.rig.lights} pictures, {job.rig.heldout} held-out lights, truth beside them"
+        rig = rig_of(job.rig)
+        simulate(made, rig, out, seed=job.seed, overwrite=job.overwrite, progress=progress)
+    return f"{out}: {len(rig.lights)} pictures, {len(rig.sweeps)} sweeps, {len(rig.heldout)} held-out lights, the truth"
 
 
 def rig_of(settings: RigSettings) -> SimulatedRig:
@@ -50,7 +56,7 @@ def rig_of(settings: RigSettings) -> SimulatedRig:
         basis_tilt_deg=settings.basis_angle_deg,
         spread_deg=(min(12.0, settings.spread_deg), settings.spread_deg),
         heldout=(settings.heldout, 1 if settings.heldout else 0),
-        sweeps=(min(settings.sweeps, settings.lights), min(settings.sweeps, settings.lights) if settings.orthogonal else 0),
+        sweeps=(settings.sweeps, settings.sweeps if settings.orthogonal else 0),
         slab_px=(settings.slab_width_px, settings.slab_step_px),
         camera=camera,
     )

@@ -102,7 +102,10 @@ def test_a_run_leaves_nothing_of_its_own(ran, tmp_path):
     [
         ("fit object=wax fit.n_ss=3", "fit.n_ss: no such setting; did you mean fit.n_s?"),
         ("fit objct=wax", "objct: no such setting; did you mean object?"),
-        ("fit object=wux", "object=wux: no such option; did you mean wax? (one of generic, plastic, pudding, wax)"),
+        (
+            "fit object=wux",
+            "object=wux: no such option; did you mean wax? (one of generic, marble, plastic, pudding, skin, wax)",
+        ),
         ("fit object=wax fit.n_s=abc", "fit.n_s=abc: expected a number or null"),
         ("fit object=wax fit.max_iterations=1.5", "fit.max_iterations=1.5: expected a whole number"),
         ("fit object=wax overwrite=3", "overwrite=3: expected true or false"),
@@ -257,6 +260,16 @@ def test_help_comes_at_once_and_imports_nothing_heavy(words):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert time.monotonic() - started_s < 1.0
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    environment = os.environ | {"PYTHONPATH": str(Path(reflectsep.__file__).parent.parent)}
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "reflectsep", "--help"]
+    done = subprocess.run(command, env=environment, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_help_lists_every_job_and_every_option(capsys):

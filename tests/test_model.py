@@ -28,14 +28,18 @@ def double(*values):
 def some_pixels(pixels=5, channels=2, lights=6, softness=0.0, haze=0.0, n_d=1.3):
     g = torch.Generator().manual_seed(4)
     rand = lambda *n: torch.rand(*n, generator=g, dtype=torch.float64)  # noqa: E731
-    shared = Globals(a=double(-0.9, -0.8, -0.95), n_s=double(7.0)[0], n_d=n_d, softness=double(softness)[0], haze=double(haze)[0])
+    shared = Globals(
+        a=double(-0.9, -0.8, -0.95), n_s=double(7.0)[0], n_d=n_d, softness=double(softness)[0], haze=double(haze)[0]
+    )
     alpha = torch.cat([torch.eye(3, dtype=torch.float64), 1.5 * rand(lights - 3, 3) - 0.3])
     # Some patches face away, some lobes are dark.
     d, s, B = 0.8 * rand(pixels, channels, 3) - 0.2, 0.2 * rand(pixels, channels, lights), 2 + 3 * rand(pixels)
     return d, s, B, shared, alpha
 
 
-def scalar_picture(d, s, B, shared, alpha, softness, haze, p, c, j):
+def scalar_picture(  # noqa: PLR0917
+    d, s, B, shared, alpha, softness, haze, p, c, j
+):
     """Eqs. 20 and 21 for one pixel, channel and light, in plain numbers."""
     channels = d.shape[1]
     root = sum(float(alpha[j, i]) * float(d[p, c, i]) for i in range(3)) + float(s[p, c, j])
@@ -80,7 +84,7 @@ def test_a_fitted_n_d_of_one_gives_what_the_number_one_gives():
 def test_gradients_are_those_of_finite_differences():
     d, s, B, shared, alpha = some_pixels(pixels=3, softness=0.3, haze=0.02)
 
-    def picture(d, s, B, a, n_s, n_d, softness, haze, alpha):
+    def picture(d, s, B, a, n_s, n_d, softness, haze, alpha):  # noqa: PLR0917
         g = Globals(a=a, n_s=n_s, n_d=n_d, softness=softness, haze=haze)
         return reflectance(d, B, g, s=s, alpha=alpha, width=edge_width(s[..., :3], softness))
 
@@ -128,7 +132,9 @@ def test_the_soft_edge_lies_above_the_clamp_by_half_its_width_at_most(x, width):
 def test_the_single_lobe_is_homogeneous(u, factor, n_s):
     zero = double(0.0)[0]
     scaled = lobe(double(factor * u), double(n_s), zero)
-    torch.testing.assert_close(scaled, double(factor) ** n_s * lobe(double(u), double(n_s), zero), rtol=1e-8, atol=1e-12)
+    torch.testing.assert_close(
+        scaled, double(factor) ** n_s * lobe(double(u), double(n_s), zero), rtol=1e-8, atol=1e-12
+    )
 
 
 @given(st.floats(0, 3), st.floats(1, 60), st.floats(0, 0.5))
@@ -137,11 +143,11 @@ def test_haze_adds_the_lobe_at_an_eighth_of_its_exponent(u, n_s, haze):
     torch.testing.assert_close(value, double(u**n_s + haze * u ** (n_s / HAZE_RATIO)))
 
 
-@given(finite, st.floats(0.3, 3))
+@given(finite.filter(lambda x: x == 0 or abs(x) > 1e-30), st.floats(0.3, 3))
 def test_the_signed_root_keeps_the_sign_and_undoes_the_power(x, n_d):
     root = signed_root(double(x), n_d)
     assert root.sign() == double(x).sign()
-    torch.testing.assert_close(root.sign() * root.abs() ** n_d, double(x), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(root.sign() * root.abs() ** n_d, double(x), rtol=1e-9, atol=0)
 
 
 def test_the_signed_root_of_noise_about_zero_is_unbiased():
@@ -151,7 +157,7 @@ def test_the_signed_root_of_noise_about_zero_is_unbiased():
 
 
 def test_the_lobe_is_driven_by_the_mean_over_channels():
-    d, s, B, shared, alpha = some_pixels()
+    d, _, B, shared, alpha = some_pixels()
     u = lobe_argument(d, B, shared.a, alpha)
     assert torch.equal(u, lobe_argument(d.flip(1), B, shared.a, alpha))
     torch.testing.assert_close(u, lobe_argument(d.mean(1, keepdim=True), B, shared.a, alpha))
@@ -160,10 +166,10 @@ def test_the_lobe_is_driven_by_the_mean_over_channels():
 def test_edge_width_is_a_share_of_the_mean_scattering_and_never_negative():
     s = double(0.1, 0.2, 0.3)[None]
     torch.testing.assert_close(edge_width(s, double(0.5)[0]), double(0.1)[None])
-    assert torch.equal(edge_width(s, double(-0.5)[0]), double(0.0)[None]) or float(edge_width(-s, double(0.5)[0])) == 0.0
+    assert float(edge_width(-s, double(0.5)[0])) == 0.0
 
 
 def test_diffuse_with_a_plain_one_is_its_argument_clamped():
     root = double(-0.3, 0.0, 0.7)
-    assert torch.equal(diffuse(root, double(0.0), 1.0), double(0.0, 0.0, 0.7))
+    torch.testing.assert_close(diffuse(root, double(0.0), 1.0), double(0.0, 0.0, 0.7))
     torch.testing.assert_close(diffuse(root, double(0.0), 2.0), double(0.0, 0.0, 0.49))

@@ -23,6 +23,26 @@ def test_one_line_for_every_stage_however_many_steps():
     assert [line.split(":")[0] for line in lines] == ["sweep L1", "fit"]
 
 
+def test_a_second_end_of_a_stage_shows_nothing_and_a_second_run_does():
+    stream = io.StringIO()
+    with progress.shown(stream=stream) as show:
+        for done in (1, 2, 2):
+            show("joint fit", done, 2)
+        for done in (1, 2):
+            show("joint fit", done, 2)
+    assert [line.split(":")[0] for line in stream.getvalue().splitlines()] == ["joint fit", "joint fit"]
+
+
+def test_time_before_the_first_report_belongs_to_the_stage(monkeypatch):
+    stream, now_s = io.StringIO(), [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now_s[0])
+    with progress.shown(stream=stream) as show:
+        for stage, done, at_s in [("a", 0, 1.0), ("a", 1, 3.0), ("b", 1, 7.0), ("c", 0, 9.0), ("c", 1, 10.0)]:
+            now_s[0] = at_s
+            show(stage, done, 1)
+    assert stream.getvalue().splitlines() == ["a: 2.0 s", "b: 4.0 s", "c: 1.0 s"]
+
+
 def test_prefix_tells_runs_apart():
     stream = io.StringIO()
     with progress.shown("object=wax: ", stream=stream) as show:
@@ -54,6 +74,15 @@ def test_bars_know_their_end():
 def test_bar_of_a_stage_that_ended_early_is_full():
     stream = Terminal()
     with progress.shown(stream=stream) as show:
+        show("fit", 7, 60)
+        show("write", 1, 1)
+    assert "7/7" in stream.getvalue()
+
+
+def test_bar_of_a_stage_that_is_done_again_may_end_early():
+    stream = Terminal()
+    with progress.shown(stream=stream) as show:
+        show("fit", 60, 60)
         show("fit", 7, 60)
         show("write", 1, 1)
     assert "7/7" in stream.getvalue()

@@ -19,11 +19,11 @@ SHAPE_SD = 0.1
 """Scatter of log B about its geometric value before anything is known of it; 0.2 where the lights are unknown."""
 SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.02, 0.015, 0.01
 """No prior is taken to be firmer than this: what lies below is the accuracy of the model itself."""
-PARALLEL_SD_MOST = 0.06
-"""Beyond this scatter the direction of s says nothing of that of d."""
+PARALLEL_SD_FIRM = 0.06
+"""Beyond this scatter the direction of s says little of that of d, and counts half."""
 RATIO_SIGMA_PX = 3.0
 HEIGHT_FACTOR = 2.0
-"""Peak of the lobe that is believed, over the largest value that stands above the robust body (which takes part of it)."""
+"""Peak of the lobe that is believed, over the largest value above the robust body, which takes some of it."""
 VISIBLE = 3.0
 """A lobe counts as seen where it exceeds this many standard deviations of the noise."""
 
@@ -56,22 +56,24 @@ def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], si
     power = obs.s_basis.square().sum((1, 2))
     if not bool((power > 0).any()):
         return priors
-    return replace(priors, parallel=parallel_weight(obs, body, sigma))
+    return replace(priors, parallel=parallel_weight(obs, parallel_spread(obs, body), sigma))
 
 
-def parallel_weight(
-    obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float
-) -> Float[Tensor, "pixels"]:
-    """Weight of `d + s parallel to s`: from how parallel the robust body already is; 0 where it is not."""
+def parallel_spread(obs: Observations, body: Float[Tensor, "pixels channels 3"]) -> float:
+    """How far the whole diffuse root is from parallel to s, relative to |s|: median standard deviation of a light."""
     s = obs.s_basis
     size = s.square().sum(-1, keepdim=True).sqrt()
     along = (body * s).sum(-1, keepdim=True) / size.square().clamp_min(1e-12)
     off = (body - along * s).square().sum(-1).sqrt().mean(-1)
     size = size[..., 0].mean(-1)
     lit = size > 0.1 * size.max()
-    spread = float((off[lit] / size[lit]).median()) / 1.18  # median of a Rayleigh variable in standard deviations
-    if spread > PARALLEL_SD_MOST:
-        return torch.zeros_like(size)
+    return float((off[lit] / size[lit]).median()) / 1.18  # median of a Rayleigh variable in standard deviations
+
+
+def parallel_weight(obs: Observations, spread: float, sigma: float) -> Float[Tensor, "pixels"]:
+    """Weight of `d + s parallel to s` for a scatter of `spread`."""
+    size = obs.s_basis.square().sum(-1).sqrt().mean(-1)
+    spread = spread if spread <= PARALLEL_SD_FIRM else 2.0 * spread
     return 1.0 / (max(spread, PARALLEL_SD_LEAST) * size + 0.1 * sigma)
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """Choices of a fit; the defaults are the method at its best, the alternatives the paper's own and the baseline's."""
+    """Choices of a fit; the defaults are the method at its best, the others the paper's own and the baseline's."""
 
     method: Literal["joint", "two_step"] = "joint"
     """All parameters together, or globals on chosen pixels first and then every pixel on its own (paper, section 5)."""
@@ -26,8 +26,9 @@ class FitOptions:
     lambda_other: float = 2.0
     robust: Literal["huber", "none"] = "huber"
     """Loss of the pictures' residuals."""
-    lobe: Literal["auto", "single"] = "auto"
-    """Add a haze and a soft shadow edge where the pictures ask for them, or hold to the paper's formula."""
+    lobe: Literal["auto", "haze", "single"] = "auto"
+    """Soft shadow edges where the pictures ask for them; a haze around the highlight besides, which needs scattering
+    known to a per cent or it takes diffuse light for haze; or the paper's formula alone."""
     prior: Literal["auto", "none"] = "auto"
     """Priors of a strength taken from the data, or none but a bound on the lobe."""
     max_iterations: int = 20

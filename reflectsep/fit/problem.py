@@ -25,6 +25,8 @@ from reflectsep.solve.problem import BlockProblem
 SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haze", "log_n_d")
 LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
 
+LEAST_LOG_N_S = 1.4
+"""log of 4: a broader lobe is no highlight but diffuse light that the diffuse part has not explained."""
 MOST_LOG_N_S = 5.3
 """log of 200: a sharper lobe is a mirror image, of which a handful of directional lights sees single pixels."""
 
@@ -122,7 +124,7 @@ class Locals:
     """A pixel's unknowns by name."""
 
     d: Float[Tensor, "pixels channels 3"]
-    log_B: Float[Tensor, "pixels"]
+    log_B: Float[Tensor, "pixels"]  # noqa: N815
     s: Float[Tensor, "pixels channels 3"] | None
 
     @property
@@ -156,7 +158,7 @@ def unpack_globals(shared: Float[Tensor, "8"], n_d: float | None) -> Globals:
 
 
 def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: bool) -> Float[Tensor, "*pixels"]:
-    """log of |M d|^2 / (M d . V), or of mean_k d where the lights are unknown: C_2 / B by the lobe's geometry.
+    """Log of |M d|^2 / (M d . V), or of mean_k d where the lights are unknown: C_2 / B by the lobe's geometry.
 
     d_k = q N.L_k gives M d = q N; and B d_k = C_2 (N.V)(N.L_k) (Eqs. 6, 7 and 18), hence B = C_2 (N.V) / q.
     """
@@ -178,7 +180,12 @@ def pixel_residual(
     s = obs.s_basis if x.s is None else x.s
     s_all = obs.s if x.s is None else x.s @ obs.alpha.mT
     model = reflectance(
-        x.d, x.B, unpack_globals(shared, obs.n_d), s=s_all, alpha=obs.alpha, width=edge_width(obs.s_basis, shared[SOFTNESS])
+        x.d,
+        x.B,
+        unpack_globals(shared, obs.n_d),
+        s=s_all,
+        alpha=obs.alpha,
+        width=edge_width(obs.s_basis, shared[SOFTNESS]),
     )
     misfit = model - obs.images
     # A clipped value is only a lower bound: a brighter model costs nothing.
@@ -209,6 +216,7 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             (shared[LOG_C_2] - log_C_1 - torch.log(shared.new_tensor(2.0))) / priors.mirror_sd,
             excess.clamp_min(0.0) / priors.height_sd,
             (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.height_sd,
+            (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.height_sd,
             shared[SOFTNESS] / priors.softness_sd,
             shared[ROOT_HAZE] / priors.haze_sd,
         ]

@@ -1,7 +1,7 @@
 """The fit of a capture: pictures and scattering in, parameters of every pixel with their certainty out.
 
-    robust body -> grid and joint fit of the globals on telling pixels -> search over B of every pixel
-    -> lobes handed on between neighbours -> everything jointly -> haze, soft shadows and neighbourhood, jointly again
+robust body -> grid and joint fit of the globals on telling pixels -> search over B of every pixel
+-> lobes handed on between neighbours -> everything jointly -> haze, soft shadows and neighbourhood, jointly again
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from reflectsep.fit.problem import (
     no_priors,
     unpack,
 )
-from reflectsep.fit.search import informative_pixels
+from reflectsep.fit.search import GRID_N_S, globals_grid, informative_pixels
 from reflectsep.fit.solution import (
     Effort,
     LocalFit,
@@ -49,13 +49,13 @@ HUBER = 5.0
 """Residuals beyond this many standard deviations are cast shadows or inter-reflections, not noise."""
 MIN_PICTURES = {"measured": 6, "none": 6, "unknown": 8}
 EXTENSION_GAIN = 0.01
-"""Haze and soft shadows stay only where they lower the whole cost by this share."""
+"""Soft shadows and the haze stay only where they lower the whole cost by this share."""
 
 
 def fit_reflectance(
     stack: PhotometricStack,
     scattering: Scattering | None,
-    options: FitOptions = FitOptions(),
+    options: FitOptions = FitOptions(),  # noqa: B008  (frozen)
     *,
     progress: Progress = silent,
 ) -> Fit:
@@ -101,7 +101,8 @@ def observe(
     if known:
         alpha = (vectors / intensity[:, None]) @ torch.linalg.inv(basis)
     images = stack.images.to(dtype)[..., mask].permute(2, 1, 0) / intensity
-    if not bool((images.amax() - images.amin()) > 0):
+    # Not exactly 0 for equal pictures: dividing by the intensities rounds.
+    if not float(images.amax() - images.amin()) > 1e-6 * float(images.abs().amax()):
         raise FitError("the pictures have no contrast inside the mask")
     use = scattering is not None and options.scattering != "none"
     n_d = scattering.n_d if use and scattering is not None else 1.0
@@ -190,12 +191,16 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
     body = robust_body(obs.images, torch.full_like(obs.images, 1.0 / state.sigma), obs.alpha, n_d)
     index = informative_pixels(obs, body, options.globals_pixels)
 
-    def globals_from(state: State) -> Tensor:
+    def globals_from(state: State, starts: list[Tensor]) -> Tensor:
         part = state.obs.take(index), state.priors.take(index)
         report = lambda done, total: progress("globals", done, total)  # noqa: E731
-        return fit_globals(*part, state.shared, state.free, effort, state.robust, report)
+        return fit_globals(*part, starts, state.free, effort, state.robust, report)
 
-    state = replace(state, shared=globals_from(state))
+    n_s = GRID_N_S if options.n_s is None else (options.n_s,)
+    part, priors = obs.take(index), state.priors.take(index)
+    first = state.shared
+    starts = globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
+    state = replace(state, shared=globals_from(state, starts))
     if options.prior == "auto":
         part, priors = state.obs.take(index), state.priors.take(index)
         found = fit_locals(part, priors, state.shared, effort, state.robust)
@@ -203,14 +208,14 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         shine = lobe_pictures(part, found.local, state.shared)[good]
         spread = shape_spread(part.take(good), found.local[good], state.shared, shine, state.sigma)
         state = replace(state, priors=replace(state.priors, shape=1.0 / spread))
-        state = replace(state, shared=globals_from(state))
+        # Under the firmer prior another start may lead lower.
+        again = globals_grid(part, state.priors.take(index), first, n_s, trim=effort.trim, best=effort.starts)
+        state = replace(state, shared=globals_from(state, [state.shared, *again]))
     progress("pixels", 0, 3)
     found = fit_locals(obs, state.priors, state.shared, effort, state.robust)
     for i, radius in enumerate((2, 1)):
         progress("pixels", i + 1, 3)
-        found = hand_on_lobes(
-            obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius
-        )
+        found = hand_on_lobes(obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius)
     progress("pixels", 3, 3)
     return with_noise_of_fit(replace(state, found=found), options)
 
@@ -226,8 +231,8 @@ def with_noise_of_fit(state: State, options: FitOptions) -> State:
 def refine(state: State, options: FitOptions, progress: Progress) -> State:
     """Everything jointly; then haze and soft shadows where they pay; then the neighbourhood's say."""
     state = joint_step(state, "joint fit", progress)
-    if options.lobe == "auto":
-        state = try_extensions(state, progress)
+    if options.lobe != "single":
+        state = try_extensions(state, options, progress)
     if bool((state.priors.parallel > 0).any()):
         for i in range(2):
             x = unpack(state.found.local, state.obs.channels)
@@ -285,14 +290,17 @@ def hand_on(state: State, radius: int) -> State:
     return replace(state, found=found)
 
 
-def try_extensions(state: State, progress: Progress) -> State:
-    """Free haze and soft shadows; keep them only if the whole cost falls by more than `EXTENSION_GAIN`."""
+def try_extensions(state: State, options: FitOptions, progress: Progress) -> State:
+    """Free soft shadows, and the haze if wanted; keep them only if the cost falls by more than `EXTENSION_GAIN`."""
     before = float(state.found.cost.sum())
     shared, free = state.shared.clone(), state.free.clone()
-    shared[ROOT_HAZE], free[ROOT_HAZE] = 0.2, True
+    if options.lobe == "haze":
+        shared[ROOT_HAZE], free[ROOT_HAZE] = 0.2, True
     if bool((state.obs.s != 0).any()):
         shared[SOFTNESS], free[SOFTNESS] = 0.12, True
-    trial = joint_step(rescored(replace(state, shared=shared, free=free)), "haze and shadow edges", progress)
+    if bool((free == state.free).all()):
+        return state
+    trial = joint_step(rescored(replace(state, shared=shared, free=free)), "shadow edges", progress)
     after = float(trial.found.cost.sum())
     kept = math.isfinite(after) and after < before * (1.0 - EXTENSION_GAIN)
     return trial if kept else state

@@ -7,6 +7,7 @@ grid of (n_s, peak height) scores the globals.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -68,7 +69,7 @@ class Candidates:
     """Solutions of the scan of every pixel, best first."""
 
     d: Float[Tensor, "pixels candidates channels 3"]
-    log_B: Float[Tensor, "pixels candidates"]
+    log_B: Float[Tensor, "pixels candidates"]  # noqa: N815
     cost: Float[Tensor, "pixels candidates"]
     """inf where a pixel has fewer minima."""
 
@@ -107,14 +108,14 @@ def scan(
     best, index = torch.where(minimum, cost, torch.inf).topk(keep, largest=False, dim=1)
     row = torch.arange(len(obs))[:, None]
     return Candidates(
-        d=colour_roots(obs, d[row, index], log_B[row, index].exp(), globals_, shared),
+        d=colour_roots(obs, d[row, index], log_B[row, index].exp(), globals_),
         log_B=log_B[row, index],
         cost=best,
     )
 
 
 def colour_roots(
-    obs: Observations, d_mean: Tensor, B: Tensor, globals_: Globals, shared: Tensor
+    obs: Observations, d_mean: Tensor, B: Tensor, globals_: Globals
 ) -> Float[Tensor, "pixels candidates channels 3"]:
     """Roots of every channel once the lobe is known from the mean: what the lobe leaves of the picture is diffuse."""
     if obs.channels == 1:
@@ -139,7 +140,13 @@ def informative_pixels(
 
 
 def globals_grid(
-    obs: Observations, priors: Priors, start: Float[Tensor, "8"], *, trim: float, best: int
+    obs: Observations,
+    priors: Priors,
+    start: Float[Tensor, "8"],
+    exponents: Sequence[float] = GRID_N_S,
+    *,
+    trim: float,
+    best: int,
 ) -> list[Float[Tensor, "8"]]:
     """The best starts of the globals: mirror lobes a_k = C_1 L_k.V, C_2 = -2 C_1 over a grid of (n_s, height).
 
@@ -147,7 +154,7 @@ def globals_grid(
     """
     scored = []
     number = max(1, int(trim * len(obs)))
-    for n_s in GRID_N_S:
+    for n_s in exponents:
         for factor in GRID_HEIGHT:
             C_1 = -((factor * priors.height) ** (1.0 / n_s))
             trial = start.clone()
@@ -158,5 +165,3 @@ def globals_grid(
             scored.append((float(cost.sort().values[:number].sum()), len(scored), trial))
     scored.sort(key=lambda entry: entry[:2])
     return [trial for _, _, trial in scored[:best]]
-
-

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -22,7 +22,7 @@ from reflectsep.fit.problem import (
     unpack,
     unpack_globals,
 )
-from reflectsep.fit.search import globals_grid, scan
+from reflectsep.fit.search import scan
 from reflectsep.model import lobe, lobe_argument, signed_root
 from reflectsep.solve.joint import JointOptions, JointSolution, local_in_chunks, solve_joint
 from reflectsep.solve.local import Termination
@@ -116,20 +116,19 @@ def merge(
 def fit_globals(
     obs: Observations,
     priors: Priors,
-    start: Float[Tensor, "8"],
+    starts: Sequence[Float[Tensor, "8"]],
     free: Bool[Tensor, "8"],
     effort: Effort,
     robust: float | None,
     report: Report,
 ) -> Float[Tensor, "8"]:
-    """The globals from chosen pixels (the paper's first step): grid, then search and joint fit in turn.
+    """The globals from chosen pixels (the paper's first step): from each start, search and joint fit in turn.
 
     Only the `trim` share of the pixels that the model explains best takes part in a joint fit: one pixel in a wrong
     minimum outweighs a hundred good ones.
     """
     number = max(4, int(effort.trim * len(obs)))
     results = []
-    starts = globals_grid(obs, priors, start, trim=effort.trim, best=effort.starts)
     for i, trial in enumerate(starts):
         shared = trial
         for _ in range(effort.rounds):

@@ -188,6 +188,16 @@ def refuse_existing(path: Path | str, overwrite: bool) -> None:
         raise ResultError(f"{path}: exists; choose another place, or say overwrite=true")
 
 
+def refuse_folder(path: Path | str, overwrite: bool) -> None:
+    """Refuse, before any work is done for it, an output folder that `atomic_folder` would refuse after the work.
+
+    Raises:
+        ResultError: as `atomic_folder`.
+    """
+    refuse_existing(path, overwrite)
+    _may_replace(Path(path), overwrite)
+
+
 def _exchange(temporary: Path, out: Path) -> None:
     """Move `temporary` to `out`; what was there goes only after, and comes back if the move fails."""
     if not os.path.lexists(out):

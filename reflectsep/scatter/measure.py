@@ -25,8 +25,8 @@ from reflectsep.scatter.exponent import complete
 from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
 from reflectsep.scatter.gains import Gains, choose_samples, exponents, solve_gains
-from reflectsep.scatter.kernel import Slab
 from reflectsep.scatter.geometry import crude_normals, surface_stretch
+from reflectsep.scatter.kernel import Slab
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage, speed_deviation, watch
 

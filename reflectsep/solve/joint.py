@@ -13,7 +13,7 @@ a few local iterations after every shared step (variable projection), the shared
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
@@ -30,7 +30,7 @@ class JointOptions:
     max_iterations: int = 40
     tolerance: float = 1e-7
     """Stop where the relative decrease of the total cost stays below this twice in a row."""
-    inner: Termination = Termination(max_iterations=6)
+    inner: Termination = field(default_factory=lambda: Termination(max_iterations=6))
     """Local iterations after every shared step."""
     chunk: int = 1 << 16
     damping: float = 1e-4
@@ -75,7 +75,8 @@ def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: 
         gradient += torch.einsum("nmg,nm->g", weighted, r) - torch.einsum("npg,npq,nq->g", W, V_inv, gl)
     if problem.shared_residual is not None:
         q = problem.shared_residual(shared)
-        Q = torch.func.jacfwd(problem.shared_residual)(shared)
+        # In single precision, zero tangents come back from torch in double.
+        Q = torch.func.jacfwd(problem.shared_residual)(shared).to(q.dtype)
         S, gradient = S + Q.mT @ Q, gradient + Q.mT @ q
     return ReducedSystem(S, gradient)
 
@@ -157,21 +158,21 @@ def solve_joint(
     history, mu, quiet, converged, iteration = [cost], options.damping, 0, False, 0
     for iteration in range(1, options.max_iterations + 1):
         system = reduced_system(problem, local, shared, options.chunk)
-        accepted = False
-        while mu < 1e8:
+        better: tuple[Tensor, Tensor, float] | None = None
+        while better is None and mu < 1e8:
             step = shared_step(system, mu, free)
             moved = follow(problem, local, shared, step, options.chunk)
             trial = local_in_chunks(problem, moved, shared + step, options.inner, options.chunk)
             trial_cost = float(trial.cost.sum() + problem.shared_cost(shared + step))
             if trial_cost < cost:
-                accepted = True
-                break
-            mu *= 8.0
-        if not accepted:
+                better = trial.local, shared + step, trial_cost
+            else:
+                mu *= 8.0
+        if better is None:
             converged = True
             break
-        decrease = cost - trial_cost
-        local, shared, cost = trial.local, shared + step, trial_cost
+        decrease = cost - better[2]
+        local, shared, cost = better
         mu = max(mu * 0.2, 1e-9)
         history.append(cost)
         if watch is not None:

@@ -77,7 +77,7 @@ def solve_local(
     active = torch.arange(len(local), device=local.device)
     part = problem
     iteration = 0
-    for iteration in range(1, termination.max_iterations + 1):
+    for iteration in range(1, termination.max_iterations + 1):  # noqa: B007  (reported at the end)
         here, mu_here, cost_here = local[active], mu[active], cost[active]
         r, J = part.linearise_local(here, shared)
         V, gradient = normal_equations(r, J, robust_weight(r, part.threshold))

@@ -61,13 +61,13 @@ class BlockProblem:
         return 0.5 * self.shared_residual(shared).square().sum()
 
     def linearise(self, local: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """r and its derivatives by l and by g at (local, shared)."""
+        """R and its derivatives by l and by g at (local, shared)."""
         if self.jacobian is not None:
             return self.jacobian(local, shared, *self.data)
         return forward_jacobian(self.residual, local, shared, self.data)
 
     def linearise_local(self, local: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
-        """r and its derivative by l alone."""
+        """R and its derivative by l alone."""
         if self.jacobian is not None:
             r, J, _ = self.jacobian(local, shared, *self.data)
             return r, J
@@ -77,12 +77,13 @@ class BlockProblem:
 def local_jacobian(
     residual: Residual, local: Tensor, shared: Tensor, data: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    """r (blocks, M) and dr/dl (blocks, M, P) alone: with eight shared parameters, half the work or less."""
+    """R (blocks, M) and dr/dl (blocks, M, P) alone: with eight shared parameters, half the work or less."""
     basis = torch.eye(local.shape[-1], dtype=local.dtype, device=local.device)
 
     def column(tangent: Tensor) -> tuple[Tensor, Tensor]:
         step = tangent.expand_as(local).contiguous()
-        return jvp(lambda x: residual(x, shared, *data), (local,), (step,))
+        result = jvp(lambda x: residual(x, shared, *data), (local,), (step,))
+        return result[0], result[1]
 
     values, columns = vmap(column, out_dims=(0, -1))(basis)
     return values[0], columns
@@ -91,16 +92,17 @@ def local_jacobian(
 def forward_jacobian(
     residual: Residual, local: Tensor, shared: Tensor, data: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """r (blocks, M), dr/dl (blocks, M, P) and dr/dg (blocks, M, G), by forward mode over the whole batch."""
+    """R (blocks, M), dr/dl (blocks, M, P) and dr/dg (blocks, M, G), by forward mode over the whole batch."""
     P, G = local.shape[-1], shared.shape[-1]
     basis = torch.eye(P + G, dtype=local.dtype, device=local.device)
 
     def column(tangent: Tensor) -> tuple[Tensor, Tensor]:
-        return jvp(
-            lambda l, g: residual(l, g, *data),
+        result = jvp(
+            lambda x, g: residual(x, g, *data),
             (local, shared),
             (tangent[:P].expand_as(local).contiguous(), tangent[P:].contiguous()),
         )
+        return result[0], result[1]
 
     values, columns = vmap(column, out_dims=(0, -1))(basis)
     return values[0], columns[..., :P], columns[..., P:]

@@ -47,7 +47,7 @@ def dense_system(problem, local, shared):
         data = [d[p] for d in problem.data]
         r = problem.residual(local[p], shared, *data)
         by_local, by_shared = torch.autograd.functional.jacobian(
-            lambda l, g, data=data: problem.residual(l, g, *data), (local[p], shared)
+            lambda x, g, data=data: problem.residual(x, g, *data), (local[p], shared)
         )
         row = torch.zeros(len(r), n * P + G, dtype=torch.float64)
         row[:, p * P : (p + 1) * P], row[:, n * P :] = by_local, by_shared

@@ -9,7 +9,11 @@ from reflectsep.solve.problem import BlockProblem, forward_jacobian, robust_cost
 
 def bend(local, shared, x):
     """Residuals that use every unknown nonlinearly; block by block and in batch alike."""
-    return local[..., :1] * torch.exp(-local[..., 1:2] * x) + shared[0] * x.square() + torch.sin(shared[1] * local[..., :1])
+    return (
+        local[..., :1] * torch.exp(-local[..., 1:2] * x)
+        + shared[0] * x.square()
+        + torch.sin(shared[1] * local[..., :1])
+    )
 
 
 def some_blocks(blocks=7, samples=5):
@@ -25,7 +29,9 @@ def test_forward_jacobian_is_that_of_every_block_on_its_own():
     r, J, K = forward_jacobian(bend, local, shared, (x,))
     assert torch.equal(r, bend(local, shared, x))
     for p in range(len(local)):
-        by_local, by_shared = torch.autograd.functional.jacobian(lambda l, g, p=p: bend(l, g, x[p]), (local[p], shared))
+        by_local, by_shared = torch.autograd.functional.jacobian(
+            lambda own, g, p=p: bend(own, g, x[p]), (local[p], shared)
+        )
         torch.testing.assert_close(J[p], by_local, rtol=1e-12, atol=1e-14)
         torch.testing.assert_close(K[p], by_shared, rtol=1e-12, atol=1e-14)
 
@@ -61,7 +67,7 @@ def test_take_cuts_data_and_keeps_the_rest():
 
 
 def test_shared_cost_is_half_the_square():
-    local, shared, x = some_blocks()
+    _, shared, x = some_blocks()
     plain = BlockProblem(residual=bend, data=(x,))
     assert float(plain.shared_cost(shared)) == 0.0
     bound = BlockProblem(residual=bend, data=(x,), shared_residual=lambda g: torch.stack([g[0] * 3, g[1] - 2]))

@@ -1,0 +1,116 @@
+"""What is said of a capture and of a result: the document of `separation.json`, and both in a few lines of text."""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import torch
+
+from reflectsep import __version__
+from reflectsep.calibrate.alpha import AlphaReport
+from reflectsep.calibrate.exposure import missing_darks
+from reflectsep.data import Capture, Fit, PhotometricStack, Scattering
+from reflectsep.flags import count
+from reflectsep.separation import Separation
+
+
+def describe(
+    capture: Capture,
+    stack: PhotometricStack,
+    lights: AlphaReport,
+    scattering: Scattering | None,
+    fitted: Fit,
+    *,
+    timings_s: Mapping[str, float],
+    settings: Mapping[str, Mapping[str, Any]],
+    heldout: Sequence[str],
+) -> dict[str, Any]:
+    """What `separation.json` says beside the globals."""
+    residual = fitted.residual[..., stack.mask]
+    warnings = [*lights.warnings, *missing_darks(capture), *fitted.warnings]
+    wanted = settings["fit"]["scattering"]
+    model = "Wu & Tang: off-specular, local diffuse and scattering"
+    if scattering is None:
+        model = "Lin & Lee: off-specular and diffuse, scattering taken as zero"
+        if wanted == "unknown":
+            model = "Wu & Tang with scattering unknown: not identifiable where no highlight is seen"
+        elif wanted == "measured":
+            warnings.append("the capture has no sweeps: scattering is taken as zero (the model of Lin & Lee)")
+    document: dict[str, Any] = {
+        "object": capture.object,
+        "capture": str(capture.folder.resolve()),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "model": model,
+        "heldout": list(heldout),
+        "n_d_source": "assumed" if scattering is None else scattering.n_d_source,
+        "covariance": {"order": list(fitted.global_names), "values": fitted.covariance.tolist()},
+        "alpha_source": dict(zip(lights.names, lights.source, strict=True)),
+        "alpha_agreement": [dataclasses.asdict(a) for a in lights.agreement],
+        "noise": fitted.noise,
+        "cost": fitted.cost,
+        "iterations": fitted.iterations,
+        "residual": {
+            "rms": float(residual.square().mean().sqrt()),
+            "rms_by_light": {n: float(residual[i].square().mean().sqrt()) for i, n in enumerate(stack.names)},
+            "largest": float(residual.abs().amax()),
+        },
+        "settings": {group: dict(values) for group, values in settings.items()},
+        "versions": {
+            "reflectsep": __version__,
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "timings_s": dict(timings_s),
+    }
+    if scattering is not None:
+        warnings.extend(scattering.warnings)
+        document["n_d_sd"] = scattering.n_d_sd
+        document["sweeps"] = [dataclasses.asdict(report) for report in scattering.sweeps]
+    if fitted.haze > 0 or fitted.softness > 0:
+        document["extensions"] = "haze and soft shadow edges lowered the cost and were kept"
+    document["warnings"] = warnings
+    return document
+
+
+def capture_summary(capture: Capture) -> str:
+    """A capture in a few lines; no picture is read."""
+    lines = [f"capture of {capture.object} in {capture.folder}"]
+    if capture.size is not None:
+        lines.append(f"  size      {capture.size[0]} x {capture.size[1]}")
+    known = sum(capture.lights[name].direction is not None for name in capture.names)
+    lines.append(f"  pictures  {len(capture.names)} ({known} with a known light direction)")
+    lines.append(f"  basis     {', '.join(capture.basis)}")
+    lines.append(f"  encoding  {capture.encoding.kind}")
+    for sweep in capture.sweeps:
+        lost = f", {len(sweep.lost)} lost" if sweep.lost else ""
+        lines.append(f"  sweep     {sweep.light} along {sweep.direction}: {sweep.count} frames{lost}, {sweep.kind}")
+    if not capture.sweeps:
+        lines.append("  sweeps    none: a fit of it is the model of Lin & Lee")
+    return "\n".join(lines)
+
+
+def summary(separation: Separation, *, full: bool = False) -> str:
+    """A result in a few lines."""
+    document = separation.document
+    globals_ = f"n_s {float(separation.n_s):.2f}, n_d {float(separation.n_d):.4f}"
+    a = ", ".join(f"{v:.3f}" for v in separation.a.tolist())
+    rms = document.get("residual", {}).get("rms", float("nan"))
+    lines = [f"{document.get('model', '')}; a = ({a}), {globals_}, residual {rms:.2g} rms"]
+    lines += [f"  warning: {text}" for text in document.get("warnings", [])]
+    if full:
+        lines.insert(0, f"result of {document.get('object', '?')} from {document.get('capture', '?')}")
+        lines.append(f"  lights    {', '.join(separation.names)}; basis {', '.join(separation.basis)}")
+        height, width = separation.mask.shape
+        lines.append(f"  size      {width} x {height}, {int(separation.mask.sum())} pixels on the object")
+        for sweep in document.get("sweeps", []):
+            gain = f"C {sweep['gain']:.4f} +- {sweep['gain_sd']:.2g}"
+            lines.append(f"  sweep     {sweep['light']} along {sweep['direction']}: {gain}")
+        lines += [f"  {flag.lower():18s}{number}" for flag, number in count(separation.flags).items() if number]
+        lines.append(f"  time      {sum(document.get('timings_s', {}).values()):.1f} s")
+    return "\n".join(lines)

@@ -1,0 +1,254 @@
+"""The whole chain on a tiny object: capture, fit, save, load, relight, compare; and the public Python interface.
+
+Starts of the fit are thinned out: what is tested here is that the stages fit together, not how well each does.
+"""
+
+import dataclasses
+import functools
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+import reflectsep
+from reflectsep import pipeline
+from reflectsep.comparison import bounded
+from reflectsep.config import (
+    CompareJob,
+    DemoJob,
+    FitJob,
+    FitSettings,
+    InfoJob,
+    ObjectSettings,
+    RelightJob,
+    RigSettings,
+    SimulateJob,
+)
+from reflectsep.errors import LightError, ResultError, SettingsError
+from reflectsep.fit import reflectance
+from reflectsep.io.exr import read_channels
+from reflectsep.io.pictures import read_picture
+
+QUICK = FitSettings(tolerance=1e-2, max_iterations=2, globals_pixels=40, lobe="single", scattering_sd=0.0)
+RIG = RigSettings(slab_width_px=8.0, slab_step_px=4.0, lights=7, sweeps=3, heldout=2)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def hasty():
+    """One start and one round each: seconds instead of a minute."""
+    with pytest.MonkeyPatch.context() as patch:
+        effort = functools.partial(reflectance.Effort, minima=1, rounds=1, starts=1)
+        patch.setattr(reflectance, "Effort", effort)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where everything of this module is."""
+    return tmp_path_factory.mktemp("pipeline")
+
+
+@pytest.fixture(scope="module")
+def captured(folder):
+    """A capture of seven pictures and three sweeps."""
+    out = folder / "capture"
+    pipeline.run_simulate(SimulateJob(object=ObjectSettings(name="wax", size_px=28), rig=RIG, out=str(out)))
+    return out
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Steps of every stage of the fit, as (done, total)."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def said(folder, captured, seen):
+    """What the fit says; its result, without light L7, is beside the capture."""
+    job = FitJob(capture=str(captured), out=str(folder / "result"), fit=QUICK, heldout=["L7"])
+    return pipeline.run_fit(job, lambda stage, done, total: seen.setdefault(stage, []).append((done, total)))
+
+
+@pytest.fixture(scope="module")
+def result(folder, said):
+    """The result folder."""
+    return folder / "result"
+
+
+def test_fit_says_what_it_found(result, said):
+    assert said.startswith(f"{result}: Wu & Tang")
+    assert {"specular.exr", "scattering.exr", "parameters.exr", "separation.json", "previews"} <= {
+        path.name for path in result.iterdir()
+    }
+    assert not list(result.parent.glob(".*"))
+
+
+def test_document_says_how_it_came_about(result, captured):
+    document = json.loads((result / "separation.json").read_text())
+    assert document["capture"] == str(captured.resolve())
+    assert document["heldout"] == ["L7"]
+    assert document["settings"]["fit"] == dataclasses.asdict(QUICK)
+    assert set(document["timings_s"]) == {"pictures", "scattering", "fit"}
+    assert [sweep["light"] for sweep in document["sweeps"]] == ["L1", "L2", "L3"]
+    assert document["versions"]["reflectsep"] == reflectsep.__version__
+    assert list(document["lights"]) == ["L1", "L2", "L3", "L4", "L5", "L6"]
+
+
+def test_components_add_up_to_the_picture(result, captured):
+    separation = reflectsep.load(result)
+    for i, name in enumerate(separation.basis):
+        picture, _ = read_picture(captured / "full" / f"{name}.exr")
+        whole = separation.highlight_free[i] + separation.specular[i]
+        torch.testing.assert_close(whole[:, separation.mask], picture[:, separation.mask], rtol=1e-5, atol=1e-6)
+        model = separation.diffuse[i] + separation.specular[i]
+        residual = separation.residual[i][:, separation.mask]
+        difference = (picture - model)[:, separation.mask]
+        torch.testing.assert_close(residual.abs(), difference.abs(), rtol=1e-3, atol=2e-3)
+    assert not separation.specular[:, :, ~separation.mask].any()
+
+
+def test_relit_pictures_of_the_command_are_those_of_python(result, captured, tmp_path):
+    out = tmp_path / "relit"
+    said = pipeline.run_relight(RelightJob(result=str(result), alpha=[0.2, 0.3, 0.5], intensity=2.0, out=str(out)))
+    assert said == f"{out}: 1 picture"
+    (plane,) = read_channels(out / "relit.exr").values()
+    expected = reflectsep.load(result).relight(torch.tensor([0.4, 0.6, 1.0]))
+    np.testing.assert_allclose(plane, expected[0].numpy(), rtol=1e-5, atol=1e-7)
+
+
+def test_a_basis_light_by_direction_is_its_alpha(result, captured, tmp_path):
+    light = reflectsep.load_capture(captured).lights["L2"]
+    job = RelightJob(result=str(result), direction=list(light.direction), out=str(tmp_path / "relit"))
+    separation = reflectsep.load(result)
+    (mix,) = pipeline.mixes(job, separation).values()
+    torch.testing.assert_close(torch.tensor(mix.alpha), torch.tensor([0.0, 1.0, 0.0]), rtol=0, atol=1e-5)
+
+
+def test_lights_of_a_file_and_of_an_orbit_are_written_by_name(result, captured, tmp_path):
+    lights = RelightJob(result=str(result), lights=str(captured / "heldout.json"), out=str(tmp_path / "a"))
+    pipeline.run_relight(lights)
+    names = set(json.loads((captured / "heldout.json").read_text())["lights"])
+    assert {path.stem for path in (tmp_path / "a").glob("*.exr")} == names
+    pipeline.run_relight(RelightJob(result=str(result), orbit=3, out=str(tmp_path / "b")))
+    assert len(list((tmp_path / "b").glob("*.exr"))) == 3
+
+
+def test_comparison_has_the_held_out_lights_and_the_truth(result, tmp_path):
+    out = tmp_path / "figure.png"
+    said = pipeline.run_compare(CompareJob(result=str(result), out=str(out)))
+    assert out.read_bytes().startswith(b"\x89PNG")
+    lines = said.splitlines()
+    assert [line.split()[0] for line in lines[1:5]] == ["L7", "L8", "L9", "L10"]
+    assert all("ours" in line and "Lin & Lee" in line for line in lines[1:5])
+    assert sum("of the truth" in line for line in lines) == 5
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_overflowing_picture_is_bounded_and_others_are_left_as_they_are():
+    real = torch.tensor([[[0.5, 2.0]]])
+    good = torch.tensor([[[0.1, 3.0]]])
+    assert torch.equal(bounded(good, real), good)
+    wild = torch.tensor([[[float("inf"), float("nan")]]])
+    assert torch.equal(bounded(wild, real), torch.full_like(wild, 200.0))
+
+
+def test_comparison_needs_the_capture(result, tmp_path):
+    separation = dataclasses.replace(reflectsep.load(result), document={"capture": str(tmp_path / "gone")})
+    with pytest.raises(ResultError, match=r"its capture '.*gone' is not there; give capture=FOLDER"):
+        pipeline.recorded_capture(separation, "result")
+    with pytest.raises(ResultError, match=r"result: separation.json has no usable settings.fit"):
+        pipeline.recorded_settings(separation, "result")
+
+
+def test_damaged_result_is_refused_in_one_line(result, tmp_path):
+    copy = shutil.copytree(result, tmp_path / "copy")
+    (copy / "specular.exr").write_bytes((copy / "specular.exr").read_bytes()[:-50])
+    for job, run in (
+        (RelightJob(result=str(copy), orbit=3, out=str(tmp_path / "relit")), pipeline.run_relight),
+        (CompareJob(result=str(copy), out=str(tmp_path / "figure.png")), pipeline.run_compare),
+        (InfoJob(path=str(copy)), pipeline.run_info),
+    ):
+        with pytest.raises(ResultError, match=r"copy/specular\.exr") as caught:
+            run(job)
+        assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
+
+
+def test_info_tells_of_both(result, captured):
+    of_capture = pipeline.run_info(InfoJob(path=str(captured)))
+    assert "28 x 28" in of_capture
+    assert "7 (7 with a known light direction)" in of_capture
+    assert of_capture.count("frames, slab") == 3
+    of_result = pipeline.run_info(InfoJob(path=str(result)))
+    assert "lights    L1, L2, L3, L4, L5, L6; basis L1, L2, L3" in of_result
+    assert "C 2.0" in of_result
+
+
+def test_without_sweeps_the_fit_is_lin_and_lee_and_says_so(captured):
+    capture = dataclasses.replace(reflectsep.load_capture(captured), sweeps=())
+    separation = reflectsep.fit(capture, settings=QUICK, max_iterations=1, method="two_step")
+    assert separation.document["model"].startswith("Lin & Lee")
+    assert any("no sweeps" in warning for warning in separation.document["warnings"])
+    assert separation.document["settings"]["fit"]["method"] == "two_step"
+    assert not separation.scattering.any()
+    assert "no sweeps" in pipeline.summary(separation)
+
+
+def test_settings_by_keyword_are_checked(captured):
+    capture = reflectsep.load_capture(captured)
+    with pytest.raises(SettingsError, match=r"fit\.n_ss: no such setting; did you mean n_s\?"):
+        reflectsep.fit(capture, n_ss=3)
+    with pytest.raises(SettingsError, match=r"fit\.n_s=-3: must be above 0"):
+        reflectsep.fit(capture, n_s=-3)
+
+
+def test_lights_that_may_not_be_left_out(captured):
+    capture = reflectsep.load_capture(captured)
+    with pytest.raises(LightError, match="L99"):
+        reflectsep.fit(capture, heldout=["L99"])
+
+
+def test_plain_folder_of_pictures_fits(captured, tmp_path):
+    capture = reflectsep.load_capture(captured)
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    rows = [str(len(capture.names))]
+    for name in capture.names:
+        shutil.copy(captured / "full" / f"{name}.exr", plain / f"{name}.exr")
+        rows.append(f"{name}.exr " + " ".join(f"{x:.6f}" for x in capture.lights[name].direction))
+    (plain / "lights.lp").write_text("\n".join(rows) + "\n")
+    said = pipeline.run_fit(FitJob(capture=str(plain), out=str(tmp_path / "result"), fit=QUICK))
+    assert "Lin & Lee" in said
+    separation = reflectsep.load(tmp_path / "result")
+    assert len(separation.names) == 7
+    assert separation.document["residual"]["rms"] < 0.05
+
+
+def test_progress_of_every_stage_ends(said, seen):
+    assert {"pictures", "globals", "pixels", "joint fit"} <= set(seen)
+    assert sum(stage.startswith("sweep") for stage in seen) >= 3
+    assert all(0 <= done <= total for steps in seen.values() for done, total in steps)
+    assert all(steps[-1][0] == steps[-1][1] for steps in seen.values()), seen
+
+
+@pytest.mark.slow
+def test_colour(tmp_path):
+    out = tmp_path / "colour"
+    item = ObjectSettings(name="skin", preset="skin", size_px=20, channels=3)
+    pipeline.run_simulate(SimulateJob(object=item, rig=RIG, out=str(out)))
+    pipeline.run_fit(FitJob(capture=str(out), out=str(tmp_path / "result"), fit=QUICK))
+    separation = reflectsep.load(tmp_path / "result")
+    assert separation.scattering.shape == (3, 3, 20, 20)
+    assert separation.relight(torch.eye(3)).shape == (3, 3, 20, 20)
+
+
+@pytest.mark.slow
+def test_demo_leaves_a_figure_and_relit_pictures(tmp_path):
+    out = tmp_path / "demo"
+    job = DemoJob(object=ObjectSettings(name="wax", size_px=28), rig=RIG, fit=QUICK, out=str(out))
+    said = pipeline.run_demo(job)
+    assert f"look at {out / 'compare.png'}" in said
+    assert {path.name for path in out.iterdir()} == {"capture", "result", "relit", "compare.png"}
+    assert len(list((out / "relit").glob("*.exr"))) == 3
