@@ -19,8 +19,8 @@ SHAPE_SD = 0.1
 """Scatter of log B about its geometric value before anything is known of it; 0.2 where the lights are unknown."""
 SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.02, 0.015, 0.01
 """No prior is taken to be firmer than this: what lies below is the accuracy of the model itself."""
-PARALLEL_SD_FIRM = 0.06
-"""Beyond this scatter the direction of s says little of that of d, and counts half."""
+PARALLEL_SD_MOST = 0.06
+"""Beyond this scatter the direction of s says nothing of that of d."""
 RATIO_SIGMA_PX = 3.0
 HEIGHT_FACTOR = 2.0
 """Peak of the lobe that is believed, over the largest value above the robust body, which takes some of it."""
@@ -71,9 +71,10 @@ def parallel_spread(obs: Observations, body: Float[Tensor, "pixels channels 3"])
 
 
 def parallel_weight(obs: Observations, spread: float, sigma: float) -> Float[Tensor, "pixels"]:
-    """Weight of `d + s parallel to s` for a scatter of `spread`."""
+    """Weight of `d + s parallel to s` for a scatter of `spread`; 0 where that is no rule of this object."""
     size = obs.s_basis.square().sum(-1).sqrt().mean(-1)
-    spread = spread if spread <= PARALLEL_SD_FIRM else 2.0 * spread
+    if spread > PARALLEL_SD_MOST:
+        return torch.zeros_like(size)
     return 1.0 / (max(spread, PARALLEL_SD_LEAST) * size + 0.1 * sigma)
 
 
