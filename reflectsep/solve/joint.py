@@ -85,10 +85,13 @@ def shared_step(system: ReducedSystem, mu: float, free: Tensor | None) -> Tensor
     """-(S + mu diag S)^-1 gradient over the free parameters, 0 for the others."""
     G = len(system.gradient)
     index = torch.arange(G) if free is None else free.nonzero()[:, 0]
-    S = system.S[index][:, index]
-    S = S + mu * torch.diag(S.diagonal().clamp_min(1e-30))
+    S, gradient = system.S[index][:, index], system.gradient[index]
+    # In units of each parameter's own curvature; rounding must not make the system singular in single precision.
+    unit = S.diagonal().clamp_min(1e-30).rsqrt()
+    least = 10.0 * G * torch.finfo(S.dtype).eps
+    scaled = S * unit[:, None] * unit + max(mu, least) * torch.eye(len(index), dtype=S.dtype, device=S.device)
     step = torch.zeros_like(system.gradient)
-    step[index] = -torch.linalg.solve(S, system.gradient[index])
+    step[index] = -unit * torch.linalg.solve(scaled, unit * gradient)
     return step
 
 
@@ -97,10 +100,12 @@ def inverse(V: Float[Tensor, "blocks P P"]) -> Float[Tensor, "blocks P P"]:
     diagonal = V.diagonal(dim1=-2, dim2=-1)
     unit = diagonal.clamp_min(1e-12 * diagonal.amax(-1, keepdim=True)).clamp_min(1e-30).rsqrt()
     system = V * unit[..., :, None] * unit[..., None, :]
-    system = system + 1e-9 * torch.eye(V.shape[-1], dtype=V.dtype, device=V.device)
+    least = max(1e-9, 20.0 * torch.finfo(V.dtype).eps)
+    system = system + least * torch.eye(V.shape[-1], dtype=V.dtype, device=V.device)
     factor, info = torch.linalg.cholesky_ex(system)
     result = torch.cholesky_inverse(factor) * unit[..., :, None] * unit[..., None, :]
-    return torch.where((info == 0)[..., None, None], result, torch.zeros_like(result))
+    sound = (info == 0)[..., None, None] & result.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+    return torch.where(sound, result, torch.zeros_like(result))
 
 
 def follow(problem: BlockProblem, local: Tensor, shared: Tensor, step: Tensor, chunk: int) -> Tensor:
