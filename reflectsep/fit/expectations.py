@@ -28,6 +28,11 @@ VISIBLE = 3.0
 """A lobe counts as seen where it exceeds this many standard deviations of the noise."""
 
 
+def near_maximum(values: Float[Tensor, "pixels"]) -> float:
+    """The 99.9 % quantile, of some hundred thousand of the pixels at most."""
+    return float(torch.quantile(values[:: max(1, len(values) // 100_000)], 0.999))
+
+
 def noise_level(
     images: Float[Tensor, "pixels channels lights"],
     residual: Float[Tensor, "pixels channels lights"],
@@ -40,14 +45,13 @@ def noise_level(
     lights = images.shape[-1]
     freedom = max(lights - unknowns, 1) / lights
     rms = residual.square().mean((1, 2)).sqrt()
-    peak = float(torch.quantile(images.amax((1, 2))[:: max(1, len(images) // 100_000)], 0.999))
-    return max(float(rms.median()) / freedom**0.5, 3e-4 * peak)
+    return max(float(rms.median()) / freedom**0.5, 3e-4 * near_maximum(images.amax((1, 2))))
 
 
 def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float) -> Priors:
     """What can be expected before any lobe is fitted."""
     above = (obs.images - (body @ obs.alpha.mT).clamp_min(0.0)).mean(1).amax(-1)
-    highest = float(torch.quantile(above[:: max(1, len(above) // 100_000)], 0.999))
+    highest = near_maximum(above)
     priors = replace(
         no_priors(len(obs), obs.images),
         shape=1.0 / (SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD),

@@ -16,7 +16,7 @@ from torch import Tensor
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.body import extend_into_shadow, robust_body
-from reflectsep.fit.expectations import first_priors, noise_level, shape_spread, with_ratio
+from reflectsep.fit.expectations import first_priors, near_maximum, noise_level, shape_spread, with_ratio
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.outcome import describe, picture_residual
 from reflectsep.fit.problem import (
@@ -128,7 +128,7 @@ def observe(
 def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitOptions) -> State:
     """Noise, robust body, scattering beyond the shadow's edge, first priors."""
     n_d = 1.0 if obs.n_d is None else obs.n_d
-    scale = float(torch.quantile(obs.images.amax((1, 2))[:: max(1, len(obs) // 100_000)], 0.999))
+    scale = near_maximum(obs.images.amax((1, 2)))
     if not scale > 0:
         raise FitError(f"the brightest picture values inside the mask are {scale:.3g}: nothing to fit")
     body = robust_body(obs.images, torch.full_like(obs.images, 100.0 / scale), obs.alpha, n_d)
@@ -171,6 +171,7 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
         sigma=sigma,
         shared=shared,
         free=free,
+        body=body,
         found=nothing,
     )
 
@@ -187,9 +188,7 @@ def weights(obs: Observations, options: FitOptions, sigma: float) -> Float[Tenso
 def start(state: State, options: FitOptions, progress: Progress) -> State:
     """Globals on telling pixels, then every pixel (the paper's two steps), then the noise and the shape's scatter."""
     obs, effort = state.obs, state.effort
-    n_d = 1.0 if obs.n_d is None else obs.n_d
-    body = robust_body(obs.images, torch.full_like(obs.images, 1.0 / state.sigma), obs.alpha, n_d)
-    index = informative_pixels(obs, body, options.globals_pixels)
+    index = informative_pixels(obs, state.body, options.globals_pixels)
 
     def globals_from(state: State, starts: list[Tensor]) -> Tensor:
         part = state.obs.take(index), state.priors.take(index)

@@ -24,5 +24,7 @@ class State:
     sigma: float
     shared: Float[Tensor, "8"]
     free: Bool[Tensor, "8"]
+    body: Float[Tensor, "pixels channels 3"]
+    """Robust whole diffuse root, from before any lobe was fitted."""
     found: LocalFit
     joint: JointSolution | None = None
