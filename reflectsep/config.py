@@ -59,6 +59,11 @@ class RigSettings:
     shot_noise: float = setting(0.0, "standard deviation at full scale, of full scale", at_least=0.0, at_most=0.5)
     bits: int | None = setting(None, "quantisation; null: none", at_least=4, at_most=16)
     headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
+    drift_px: float = setting(0.0, "shift of the camera between a light's full picture and its sweep", at_least=0.0)
+    drift_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
+    drift_across_px: float = setting(0.0, "shift of the camera between the lights' full pictures", at_least=0.0)
+    drift_across_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
+    drift_within_px: float = setting(0.0, "shift of the camera from a sweep's first frame to its last", at_least=0.0)
 
     def __post_init__(self) -> None:
         check(self)
