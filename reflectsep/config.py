@@ -123,6 +123,22 @@ class ScatterSettings:
 
 
 @dataclass(kw_only=True)
+class CalibrationSettings:
+    """What is corrected before anything is measured."""
+
+    key: ClassVar[str] = "calibration."
+    registration: Literal["all", "same_light", "none"] = setting(
+        "all", "drift of the camera: of all pictures, of sweeps against their full pictures alone, or not looked for"
+    )
+    motion: Literal["translation", "rigid", "affine", "homography"] = setting(
+        "homography", "the richest motion that the evidence may choose"
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
 class SimulateJob:
     """Write a simulated capture with its truth beside it."""
 
@@ -148,6 +164,7 @@ class FitJob:
     rig: RigSettings = field(default_factory=RigSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     scatter: ScatterSettings = field(default_factory=ScatterSettings)
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     capture: str = setting("", "capture folder, or pictures with a light list; default captures/NAME", path=True)
     out: str = setting("", "result folder to write; default results/NAME", path=True)
     overwrite: bool = setting(False, "replace what is there")

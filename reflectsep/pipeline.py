@@ -15,10 +15,12 @@ import torch
 from torch import Tensor
 
 from reflectsep import simulation
+from reflectsep.calibrate.alignment import AlignOptions, Alignment, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
-from reflectsep.calibrate.stack import calibrate_stack, held_out_pictures, without
+from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
 from reflectsep.comparison import compare_result
 from reflectsep.config import (
+    CalibrationSettings,
     CompareJob,
     DemoJob,
     FitJob,
@@ -36,6 +38,7 @@ from reflectsep.io.capture import load_capture
 from reflectsep.io.files import refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
+from reflectsep.io.stack import read_full, read_mask
 from reflectsep.progress import Progress, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
 from reflectsep.report.tone import tone, white_point
@@ -53,6 +56,7 @@ def fit(
     *,
     settings: FitSettings | None = None,
     scatter: ScatterSettings | None = None,
+    calibration: CalibrationSettings | None = None,
     heldout: Sequence[str] = (),
     progress: Progress = silent,
     **changes: Any,
@@ -63,6 +67,7 @@ def fit(
         capture: from `load_capture`.
         settings: of the fit; the defaults where None.
         scatter: of the sweeps; the defaults where None.
+        calibration: of what is corrected first; the defaults where None.
         heldout: lights to leave out, to compare with later.
         progress: called as (stage, done, total).
         **changes: single settings of the fit by name, as in `fit(capture, scattering="none")`.
@@ -74,14 +79,19 @@ def fit(
         ReflectsepError: whatever makes the capture unfit, in one line that names the file.
     """
     settings, scatter = changed(settings or FitSettings(), changes), scatter or ScatterSettings()
+    calibration = calibration or CalibrationSettings()
     clock = Clock()
     capture = without(capture, heldout)
     least = 8 if settings.scattering == "unknown" else 6
     progress("pictures", 0, 1)
-    stack, lights = calibrate_stack(capture, minimum=least)
+    alignment = None
+    if calibration.registration != "none":
+        alignment = alignment_of(capture, calibration, scatter, progress)
+        clock.lap("alignment")
+    stack, lights = calibrate_stack(capture, minimum=least, alignment=alignment)
     progress("pictures", 1, 1)
     clock.lap("pictures")
-    scattering = measure(capture, stack, settings, scatter, progress)
+    scattering = measure(capture, stack, settings, scatter, progress, alignment)
     clock.lap("scattering")
     fitted = fit_reflectance(stack, scattering, fit_options(settings), progress=progress)
     clock.lap("fit")
@@ -92,8 +102,13 @@ def fit(
         scattering,
         fitted,
         timings_s=clock.seconds,
-        settings={"fit": dataclasses.asdict(settings), "scatter": dataclasses.asdict(scatter)},
+        settings={
+            "fit": dataclasses.asdict(settings),
+            "scatter": dataclasses.asdict(scatter),
+            "calibration": dataclasses.asdict(calibration),
+        },
         heldout=heldout,
+        alignment=alignment,
     )
     return separate(stack, scattering, fitted, document)
 
@@ -111,18 +126,41 @@ def changed(settings: FitSettings, changes: Mapping[str, Any]) -> FitSettings:
     return dataclasses.replace(settings, **changes)
 
 
+def alignment_of(
+    capture: Capture, calibration: CalibrationSettings, scatter: ScatterSettings, progress: Progress = silent
+) -> Alignment:
+    """Motions of a capture's pictures and sweeps."""
+    response = response_of(capture)
+    raw = read_full(capture)
+    pictures = develop_pictures(capture, raw, response)
+    streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
+    options = AlignOptions(
+        scope="all" if calibration.registration == "all" else "same_light",
+        richest=calibration.motion,
+        n_d=scatter.n_d or 1.0,
+    )
+    return align(
+        capture, raw.names, pictures, raw.saturated, read_mask(capture), streams, options=options, progress=progress
+    )
+
+
 def measure(
-    capture: Capture, stack: PhotometricStack, settings: FitSettings, scatter: ScatterSettings, progress: Progress
+    capture: Capture,
+    stack: PhotometricStack,
+    settings: FitSettings,
+    scatter: ScatterSettings,
+    progress: Progress,
+    alignment: Alignment | None = None,
 ) -> Scattering | None:
     """Scattering from the sweeps; None where the capture has none or the fit wants none."""
     if not capture.sweeps or settings.scattering != "measured":
         return None
     response = response_of(capture)
-    streams = [
-        developed_stream(capture, open_sweep(capture, sweep), response)
-        for sweep in capture.sweeps
-        if sweep.light in stack.names
-    ]
+    streams = []
+    for i, sweep in enumerate(capture.sweeps):
+        if sweep.light in stack.names:
+            stream = developed_stream(capture, open_sweep(capture, sweep), response)
+            streams.append(stream if alignment is None else aligned_stream(stream, alignment.sweeps[i]))
     options = ScatterOptions(**dataclasses.asdict(scatter))
     return measure_scattering(stack, streams, options=options, progress=progress)
 
@@ -172,7 +210,12 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
     separation = fit(
-        capture, settings=job.fit, scatter=job.scatter, heldout=tuple(job.heldout or ()), progress=progress
+        capture,
+        settings=job.fit,
+        scatter=job.scatter,
+        calibration=job.calibration,
+        heldout=tuple(job.heldout or ()),
+        progress=progress,
     )
     if job.lights_file is not None:
         document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}

@@ -55,6 +55,9 @@ class RegisterOptions:
     """Larger pictures are halved until they are no larger; a twentieth of a pixel is seen there too."""
     noise_floor: float = 1e-3
     """Least residual, as a share of the picture's bright end, that is told from agreement."""
+    lenient_turn: bool = True
+    """Whether a rotation is taken where it predicts best (Akaike) rather than where it is beyond chance: right for a
+    camera that was touched, and pictures of the same light."""
     drift: bool = False
     """Whether slow drift along `time` may be found besides."""
 
@@ -142,9 +145,12 @@ def register(
     finest = pyramid[-1]
     matrix = torch.eye(3, dtype=torch.float64) if start is None else _to_level(start.double(), finest.factor)
     matrix = _coarse(pyramid, matrix, options)
-    candidates: list[tuple[Model, bool]] = [(model, False) for model in options.models]
+    cameras = [model for model in options.models if model not in ("affine", "homography")]
+    candidates: list[tuple[Model, bool]] = [(model, False) for model in cameras]
     if options.drift:
-        candidates += [(model, True) for model in options.models if model in ("translation", "rigid")]
+        # Before affine: a drift along the sweep is a stretch, and the likelier reason for one.
+        candidates += [(model, True) for model in cameras if model != "identity"]
+    candidates += [(model, False) for model in options.models if model not in cameras]
     return _choose(finest, matrix, candidates, usable, options)
 
 
@@ -208,8 +214,8 @@ def _exceeds(
     values, covariance = further @ values, further @ covariance @ further.mT
     wald = float(values @ torch.linalg.solve(covariance, values))
     k = len(further)
-    if simple[0] == "translation" and rich[0] == "rigid" and simple[1] == rich[1]:
-        return wald > 2.0 * k  # cameras turn when they are touched: what predicts best (Akaike), not what is proven
+    if options.lenient_turn and simple[0] == "translation" and rich[0] == "rigid" and simple[1] == rich[1]:
+        return wald > 2.0 * k
     return wald > k + 2 * (k * options.evidence) ** 0.5 + 2 * options.evidence
 
 

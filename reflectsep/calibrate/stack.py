@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reflectsep.calibrate.alignment import Alignment, covered
 from reflectsep.calibrate.alpha import CONDITION_LIMIT, AlphaReport, light_vector, solve_alpha
 from reflectsep.calibrate.exposure import Response, colour_of, develop, exposure_ratio, response_of
 from reflectsep.calibrate.linear_combination import EstimateSettings
+from reflectsep.calibrate.motion import warp
 from reflectsep.data import Capture, PhotometricStack
 from reflectsep.errors import CaptureError, LightError
 from reflectsep.flags import Flag, mark
@@ -42,6 +44,7 @@ def calibrate_stack(
     minimum: int = MINIMUM,
     settings: EstimateSettings | None = None,
     condition_limit: float = CONDITION_LIMIT,
+    alignment: Alignment | None = None,
 ) -> tuple[PhotometricStack, AlphaReport]:
     """Read and develop the full pictures, and find every light's alpha.
 
@@ -55,6 +58,7 @@ def calibrate_stack(
         minimum: pictures that there must be.
         settings: of alpha from the pictures, n_d among them.
         condition_limit: largest condition number of the basis lights.
+        alignment: motions to undo, before anything else is made of the pictures.
 
     Returns:
         The stack: a pixel that is not finite somewhere is 0 throughout, flagged and out of the mask. And where the
@@ -73,9 +77,13 @@ def calibrate_stack(
     raw = read_full(capture)
     on_object = read_mask(capture)
     images = develop_pictures(capture, raw, response_of(capture))
+    _check_pictures(capture, images, torch.isfinite(images), on_object)
+    seen = torch.ones_like(on_object)
+    if alignment is not None and alignment.moved:
+        images, saturated, seen = _still(raw, images, alignment)
+        raw = replace(raw, saturated=saturated)
     finite = torch.isfinite(images)
-    _check_pictures(capture, images, finite, on_object)
-    valid = finite.all(1).all(0)
+    valid = finite.all(1).all(0) & seen
     mask = on_object & valid
     if not bool(mask.any()):
         raise CaptureError(f"{capture.folder}: no pixel of the object is finite in all {len(raw.names)} pictures")
@@ -86,7 +94,8 @@ def calibrate_stack(
     )
     flags = torch.zeros(on_object.shape, dtype=torch.int32)
     flags = mark(flags, ~on_object, Flag.OUTSIDE_MASK)
-    flags = mark(flags, on_object & ~valid, Flag.INVALID_INPUT)
+    flags = mark(flags, on_object & seen & ~valid, Flag.INVALID_INPUT)
+    flags = mark(flags, on_object & ~seen, Flag.MOVED_OUT)
     flags = mark(flags, mask & raw.saturated.any(1).any(0), Flag.SATURATED)
     view = torch.tensor(capture.view, dtype=torch.float32)
     stack = PhotometricStack(
@@ -100,6 +109,19 @@ def calibrate_stack(
         flags=flags,
     )
     return stack, report
+
+
+def _still(raw: RawPictures, images: Tensor, alignment: Alignment) -> tuple[Tensor, Tensor, Tensor]:
+    """Pictures with their motions undone, each resampled once; clipped values; and pixels that all of them have."""
+    still, clipped = [], []
+    for name, picture, saturated in zip(raw.names, images, raw.saturated, strict=True):
+        motion = alignment.pictures[name]
+        if motion.applied:
+            picture, moved, _ = warp(picture, motion.matrix, saturated)  # noqa: PLW2901
+            saturated = saturated if moved is None else moved  # noqa: PLW2901
+        still.append(picture)
+        clipped.append(saturated)
+    return torch.stack(still), torch.stack(clipped), covered(alignment, *images.shape[-2:])
 
 
 def held_out_pictures(
