@@ -237,6 +237,24 @@ class InfoJob:
 
 
 @dataclass(kw_only=True)
+class CheckJob:
+    """Look at a capture before a fit: what is wrong with it, what can be expected, and what to do."""
+
+    key: ClassVar[str] = ""
+    capture: str = required("capture folder, or pictures with a light list", path=True)
+    lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
+    basis: list[str] | None = setting(None, "names of three basis lights; null: the capture's", length=3)
+    sheet: str | None = setting(None, "picture sheet to write (.png)", path=True)
+    json: bool = setting(False, "print JSON for scripts instead of a table; --json does the same")
+    overwrite: bool = setting(False, "replace a sheet that is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.sheet is not None and Path(self.sheet).suffix.lower() != ".png":
+            raise SettingsError(f"sheet={self.sheet}: must end in .png")
+
+
+@dataclass(kw_only=True)
 class DemoJob:
     """Simulate, fit, relight and compare a small object, to see the whole thing."""
 
@@ -252,7 +270,7 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | DemoJob
+Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | CheckJob | DemoJob
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
@@ -260,6 +278,7 @@ JOBS: dict[str, type[Job]] = {
     "relight": RelightJob,
     "compare": CompareJob,
     "info": InfoJob,
+    "check": CheckJob,
     "demo": DemoJob,
 }
 

@@ -6,6 +6,8 @@ load -> calibrate (stack, alpha) -> scatter (n_d, C, s) -> fit -> separate -> sa
 from __future__ import annotations
 
 import dataclasses
+import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,9 +20,11 @@ from reflectsep import simulation
 from reflectsep.calibrate.alignment import AlignOptions, Alignment, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
+from reflectsep.checking import check_capture, draw, table
 from reflectsep.comparison import compare_result
 from reflectsep.config import (
     CalibrationSettings,
+    CheckJob,
     CompareJob,
     DemoJob,
     FitJob,
@@ -41,6 +45,7 @@ from reflectsep.io.lights import read_lights
 from reflectsep.io.stack import read_full, read_mask
 from reflectsep.progress import Progress, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
+from reflectsep.report.sheet import motion_plot
 from reflectsep.report.tone import tone, white_point
 from reflectsep.scatter.measure import measure_scattering
 from reflectsep.scatter.options import ScatterOptions
@@ -195,6 +200,8 @@ def previews(separation: Separation) -> dict[str, Tensor]:
         for part, stack in parts.items():
             pixels = torch.from_numpy(tone(stack[i], white=white)).permute(2, 0, 1)
             shown[f"{name}_{part}"] = pixels.float() / 255.0
+    if "alignment" in separation.document:
+        shown["alignment"] = motion_plot(separation.document["alignment"])
     return shown
 
 
@@ -300,6 +307,29 @@ def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001 
     if (path / "separation.json").is_file():
         return summary(load(path), full=True)
     return capture_summary(load_capture(path))
+
+
+class Report(str):
+    """Text to print, and the exit code of the command that prints it."""
+
+    __slots__ = ("exit_code",)
+    exit_code: int
+
+
+def run_check(job: CheckJob, progress: Progress = silent) -> Report:
+    """Look at a capture before a fit; the exit code is 1 where something is bad."""
+    if job.sheet is not None:
+        refuse_existing(Path(job.sheet), job.overwrite)
+    capture = load_capture(
+        job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
+    )
+    result = check_capture(capture, progress)
+    if job.sheet is not None:
+        draw(result, job.sheet)
+    text = json.dumps(result.document(), indent=1) if job.json else table(result, colour=sys.stdout.isatty())
+    report = Report(text)
+    report.exit_code = 1 if result.verdict == "bad" else 0
+    return report
 
 
 def run_demo(job: DemoJob, progress: Progress = silent) -> str:

@@ -77,6 +77,8 @@ class Alignment:
     against_full: tuple[Motion, ...] = ()
     """The same sweeps against the full picture of their own light: what was measured."""
     warnings: tuple[str, ...] = ()
+    size: tuple[int, int] | None = None
+    """(width, height) of the pictures."""
 
     @property
     def moved(self) -> bool:
@@ -87,6 +89,7 @@ class Alignment:
         """As it stands in `separation.json`."""
         return {
             "reference": capture.basis[0],
+            "size": None if self.size is None else list(self.size),
             "pictures": {name: motion.document() for name, motion in self.pictures.items()},
             "sweeps": [
                 {"light": sweep.light, "direction": sweep.direction, **motion.document()}
@@ -159,7 +162,11 @@ def align(
         measured.append(own)
         sweeps.append(_composed(own, motions[sweep.light], mask))
     return Alignment(
-        pictures=motions, sweeps=tuple(sweeps), against_full=tuple(measured), warnings=tuple(warnings)
+        pictures=motions,
+        sweeps=tuple(sweeps),
+        against_full=tuple(measured),
+        warnings=tuple(warnings),
+        size=(mask.shape[1], mask.shape[0]),
     )
 
 
