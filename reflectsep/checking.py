@@ -17,7 +17,7 @@ from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, align
 from reflectsep.calibrate.alpha import AlphaReport
 from reflectsep.calibrate.exposure import developed_stream, exposure_ratio, missing_darks, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures
-from reflectsep.data import Capture, FrameStream, PhotometricStack, SweepReport
+from reflectsep.data import Capture, FrameStream, PhotometricStack
 from reflectsep.errors import SweepError
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.stack import RawPictures, read_full, read_mask
@@ -94,26 +94,28 @@ def check_capture(capture: Capture, progress: Progress = silent) -> CheckResult:
     response = response_of(capture)
     raw = read_full(capture)
     mask = read_mask(capture)
-    pictures = develop_pictures(capture, raw, response)
+    pictures, saturated = develop_pictures(capture, raw, response)
     streams: list[FrameStream] = [
         developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps
     ]
-    alignment = align(
-        capture, raw.names, pictures, raw.saturated, mask, streams, options=AlignOptions(), progress=progress
-    )
+    alignment = align(capture, raw.names, pictures, saturated, mask, streams, options=AlignOptions(), progress=progress)
     stack, lights = calibrate_stack(capture, minimum=3, alignment=alignment, condition_limit=math.inf)
     still = [aligned_stream(stream, motion) for stream, motion in zip(streams, alignment.sweeps, strict=True)]
     findings = [_count(capture), *_pictures(capture, raw, stack), *_lights(capture, lights, stack)]
     findings += _sweeps_there(capture)
     passages, gains, trouble = _pass(stack, still, progress)
     findings += trouble + _sweeps(capture, stack, passages, gains)
+    findings += [
+        Finding(subject="sweeps", value=text, verdict="bad" if "cut off" in text else "doubtful")
+        for text in alignment.warnings
+    ]
     findings += [_alignment(capture, alignment), _split(stack)]
     return CheckResult(
         capture=capture,
         findings=tuple(findings),
         stack=stack,
         pictures=pictures,
-        saturated=raw.saturated,
+        saturated=saturated,
         mask=mask,
         alignment=alignment,
         passages=tuple(passages),
@@ -143,8 +145,14 @@ def _pictures(capture: Capture, raw: RawPictures, stack: PhotometricStack) -> li
     advice = "" if verdict == "good" else f"expose {worst} shorter, or bracket it"
     value = f"{shares[worst]:.1%} of the object clipped at most ({worst})" if shares[worst] else "nothing clipped"
     findings.append(Finding(subject="saturation", value=value, verdict=verdict, advice=advice, numbers=shares))
-    peak = float(torch.stack([p[:, stack.mask].flatten().kthvalue(max(1, int(0.999 * p[:, stack.mask].numel()))).values
-                              for p in raw.values]).amax())
+    peak = float(
+        torch.stack(
+            [
+                p[:, stack.mask].flatten().kthvalue(max(1, int(0.999 * p[:, stack.mask].numel()))).values
+                for p in raw.values
+            ]
+        ).amax()
+    )
     if any(bool(s.any()) for s in raw.saturated) or not capture.full(capture.basis[0]).file.endswith(".exr"):
         findings.append(
             Finding(
@@ -313,7 +321,9 @@ def _clipped_frames(
                 subject=f"{name}: clipping",
                 value=f"{clipped:.0%} of the object clipped while lit" + ("" if solved else ": Eq. 25 has no solution"),
                 verdict="doubtful" if solved or known else "bad",
-                advice="" if solved else f"{way_out}; or bracket, or expose frames shorter, or give the slab's "
+                advice=""
+                if solved
+                else f"{way_out}; or bracket, or expose frames shorter, or give the slab's "
                 "width and step (scatter.lit_frames)",
                 numbers={"clipped": clipped, "solved": solved},
             )

@@ -133,6 +133,9 @@ class CalibrationSettings:
     motion: Literal["translation", "rigid", "affine", "homography"] = setting(
         "homography", "the richest motion that the evidence may choose"
     )
+    file: str | None = setting(
+        None, "calibration to use; null: calibration.json in the capture's folder, where there is one", path=True
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -255,6 +258,28 @@ class CheckJob:
 
 
 @dataclass(kw_only=True)
+class CalibrateJob:
+    """Find the lights and the camera's response, once for a bench, and write them beside a capture."""
+
+    key: ClassVar[str] = ""
+    capture: str = required("capture folder, or pictures with a light list", path=True)
+    chrome: str | None = setting(None, "folder of pictures of a chrome ball, NAME.png a light", path=True)
+    circle: list[float] | None = setting(None, "the ball: x, y, radius in pixels; null: its mask, or found", length=3)
+    intensity: Literal["keep", "sphere", "pictures"] = setting(
+        "keep", "strengths of the lights: as listed, from a matte ball, or jointly from the pictures"
+    )
+    matte: str | None = setting(None, "folder of pictures of a matte ball of one colour", path=True)
+    response: Literal["keep", "debevec", "robertson"] = setting(
+        "keep", "the camera's curve: as the manifest says, or from a bracket of one light"
+    )
+    out: str | None = setting(None, "file to write; null: calibration.json in the capture's folder", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
 class DemoJob:
     """Simulate, fit, relight and compare a small object, to see the whole thing."""
 
@@ -270,7 +295,7 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | CheckJob | DemoJob
+Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | CheckJob | CalibrateJob | DemoJob
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
@@ -279,6 +304,7 @@ JOBS: dict[str, type[Job]] = {
     "compare": CompareJob,
     "info": InfoJob,
     "check": CheckJob,
+    "calibrate": CalibrateJob,
     "demo": DemoJob,
 }
 

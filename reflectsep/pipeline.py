@@ -16,13 +16,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reflectsep import calibration as calibration_job
 from reflectsep import simulation
-from reflectsep.calibrate.alignment import AlignOptions, Alignment, align, aligned_stream
+from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
 from reflectsep.checking import check_capture, draw, table
 from reflectsep.comparison import compare_result
 from reflectsep.config import (
+    CalibrateJob,
     CalibrationSettings,
     CheckJob,
     CompareJob,
@@ -38,6 +40,7 @@ from reflectsep.data import Capture, Light, PhotometricStack, Scattering
 from reflectsep.errors import ResultError, SettingsError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
+from reflectsep.io import calibration as calibration_file
 from reflectsep.io.capture import load_capture
 from reflectsep.io.files import refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
@@ -86,6 +89,7 @@ def fit(
     settings, scatter = changed(settings or FitSettings(), changes), scatter or ScatterSettings()
     calibration = calibration or CalibrationSettings()
     clock = Clock()
+    capture, used = with_calibration(capture, calibration.file)
     capture = without(capture, heldout)
     least = 8 if settings.scattering == "unknown" else 6
     progress("pictures", 0, 1)
@@ -115,6 +119,8 @@ def fit(
         heldout=heldout,
         alignment=alignment,
     )
+    if used is not None:
+        document["calibration_file"] = used
     return separate(stack, scattering, fitted, document)
 
 
@@ -137,7 +143,7 @@ def alignment_of(
     """Motions of a capture's pictures and sweeps."""
     response = response_of(capture)
     raw = read_full(capture)
-    pictures = develop_pictures(capture, raw, response)
+    pictures, saturated = develop_pictures(capture, raw, response)
     streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
     options = AlignOptions(
         scope="all" if calibration.registration == "all" else "same_light",
@@ -145,7 +151,7 @@ def alignment_of(
         n_d=scatter.n_d or 1.0,
     )
     return align(
-        capture, raw.names, pictures, raw.saturated, read_mask(capture), streams, options=options, progress=progress
+        capture, raw.names, pictures, saturated, read_mask(capture), streams, options=options, progress=progress
     )
 
 
@@ -323,6 +329,7 @@ def run_check(job: CheckJob, progress: Progress = silent) -> Report:
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
+    capture, _ = with_calibration(capture, None)
     result = check_capture(capture, progress)
     if job.sheet is not None:
         draw(result, job.sheet)
@@ -330,6 +337,19 @@ def run_check(job: CheckJob, progress: Progress = silent) -> Report:
     report = Report(text)
     report.exit_code = 1 if result.verdict == "bad" else 0
     return report
+
+
+def run_calibrate(job: CalibrateJob, progress: Progress = silent) -> str:
+    """Find lights and response, and write them beside the capture."""
+    return calibration_job.calibrate(job, progress)
+
+
+def with_calibration(capture: Capture, file: str | None) -> tuple[Capture, str | None]:
+    """The capture with what a calibration file says, and which file that was."""
+    path = capture.folder / calibration_file.FILE if file is None else Path(file)
+    if file is None and not path.is_file():
+        return capture, None
+    return calibration_file.calibrated(capture, calibration_file.read_calibration(path)), str(path)
 
 
 def run_demo(job: DemoJob, progress: Progress = silent) -> str:

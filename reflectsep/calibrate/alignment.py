@@ -46,6 +46,7 @@ STRUCTURE_PX = 3.0
 AGREE_PX = 0.35
 """Fine structure that moves apart from outline and shading by more than this is no texture."""
 CLIPPED_SHARE = 0.5
+CLIPPED_BESIDE = 0.02
 DEGREE = 5
 
 
@@ -110,6 +111,8 @@ class SweepSum:
     time: Float[Tensor, "height width"]
     """When the slab passed: -1 at the first frame, 1 at the last."""
     clipped: Bool[Tensor, "height width"]
+    clipped_frames: Float[Tensor, "height width"]
+    """In how many frames."""
 
 
 def align(
@@ -156,6 +159,7 @@ def align(
             continue
         k = list(names).index(sweep.light)
         added = add_frames(stream, options.n_d, progress)
+        warnings += _too_long(sweep, added, mask)
         own = _same_light(grey[k], good[k], mask, motions[sweep.light], added, options)
         if own.reason.startswith("clipped"):
             warnings.append(f"sweep of {sweep.light} along {sweep.direction}: not registered, {own.reason}")
@@ -268,6 +272,21 @@ def _same_light(
     return _judged(found, on_object)
 
 
+def _too_long(sweep: Sweep, added: SweepSum, mask: Tensor) -> list[str]:
+    """A warning where frames other than those that light a pixel are clipped: then scattering itself is cut off."""
+    lit = added.clipped_frames[mask & added.clipped]
+    if lit.numel() == 0:
+        return []
+    # Most clipped pixels are clipped while lit alone; the slab's own width is their usual number.
+    share = float((added.clipped_frames[mask] > max(3.0, 1.5 * float(lit.quantile(0.25)))).double().mean())
+    if share < CLIPPED_BESIDE:
+        return []
+    return [
+        f"sweep of {sweep.light} along {sweep.direction}: {share:.0%} of the object is clipped in more frames than light "
+        "it, so scattering itself is cut off there: expose the frames shorter, or bracket them"
+    ]
+
+
 def _judged(found: Registration, mask: Tensor) -> Motion:
     """The motion as it is used: not at all where it is below what resampling is worth."""
     still = displacement(found.matrix, mask)
@@ -314,30 +333,32 @@ def add_frames(stream: FrameStream, n_d: float = 1.0, progress: Progress = silen
     Raises:
         CaptureError: no frame in it.
     """
-    total = moment = mass = clipped = None
+    total = moment = mass = times = None
     count = max(2, len(stream))
     received = set()
     for frame in stream:
         received.add(frame.index)
         root = _roots(frame.values, n_d).mean(0).double()
         weight = root.clamp_min(0) ** 4  # the frames that light a pixel outweigh all others
-        if total is None or moment is None or mass is None or clipped is None:
-            total, moment, mass = torch.zeros_like(root), torch.zeros_like(root), torch.zeros_like(root)
-            clipped = torch.zeros(root.shape, dtype=torch.bool)
+        if total is None or moment is None or mass is None or times is None:
+            total, moment, mass, times = (torch.zeros_like(root) for _ in range(4))
         total, mass = total + root, mass + weight
         moment = moment + weight * frame.index
         if frame.saturated is not None:
-            clipped = clipped | frame.saturated.any(0)
+            times = times + frame.saturated.any(0)
         progress(f"alignment {stream.sweep.light} {stream.sweep.direction}", frame.index + 1, len(stream))
-    if total is None or moment is None or mass is None or clipped is None:
+    if total is None or moment is None or mass is None or times is None:
         raise CaptureError(f"sweep of {stream.sweep.light} along {stream.sweep.direction}: no frames")
     passed = moment / mass.clamp_min(1e-300)
     if stream.sweep.kind == "shadow":
         passed = torch.full_like(passed, (count - 1) / 2)  # where it is dark cannot be told from the brightest frames
+    clipped = times > 0
     usable = ~clipped
     for index in set(range(count)) - received:
         usable &= (passed - index).abs() > 3
-    return SweepSum(total=total, usable=usable, time=2 * passed / (count - 1) - 1, clipped=clipped)
+    return SweepSum(
+        total=total, usable=usable, time=2 * passed / (count - 1) - 1, clipped=clipped, clipped_frames=times
+    )
 
 
 def covered(alignment: Alignment, height: int, width: int) -> Bool[Tensor, "height width"]:
@@ -365,7 +386,7 @@ class AlignedStream:
     def __len__(self) -> int:
         return len(self.stream)
 
-    def __iter__(self):  # noqa: ANN204  (as FrameStream)
+    def __iter__(self):
         last = max(1, len(self.stream) - 1)
         for frame in self.stream:
             values, saturated, _ = warp(frame.values, self.motion.at(2 * frame.index / last - 1), frame.saturated)

@@ -267,7 +267,11 @@ def _further(simple: tuple[Model, bool], rich: tuple[Model, bool]) -> Tensor:
 
 
 def _on_unseen(
-    level: _Level, simple: _State, rich: _State, first: tuple[Model, bool], second: tuple[Model, bool],
+    level: _Level,
+    simple: _State,
+    rich: _State,
+    first: tuple[Model, bool],
+    second: tuple[Model, bool],
     options: RegisterOptions,
 ) -> tuple[float, float]:
     """By how much, relatively and in standard errors, the richer model predicts pixels better that it has not seen."""
@@ -439,7 +443,7 @@ def _slope_blur(raw: Tensor, smooth: Tensor, weight: Tensor, blur_px: float) -> 
 
 
 def _residual(level: _Level, state: _State) -> tuple[Tensor, Tensor, Tensor]:
-    """moving - mix, the moved picture, and where both are measured."""
+    """Moving - mix, the moved picture, and where both are measured."""
     height, width = level.moving.shape
     places = positions(state.matrix, height, width, state.velocity[:, None, None] * level.time)
     both = sample(torch.stack([level.moving, level.moving_bad]), places, "bicubic")

@@ -20,7 +20,14 @@ FAILED = 1
 USAGE = 2
 INTERRUPTED = 130
 
-_OPTIONS = {"-h": "help", "--help": "help", "-m": "multirun", "--multirun": "multirun", "--cfg": "cfg", "--json": "json"}
+_OPTIONS = {
+    "-h": "help",
+    "--help": "help",
+    "-m": "multirun",
+    "--multirun": "multirun",
+    "--cfg": "cfg",
+    "--json": "json",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -21,6 +21,7 @@ EXAMPLES = {
     "compare": ("result=results/wax out=compare.png",),
     "info": ("captures/wax", "results/wax"),
     "check": ("capture=captures/wax", "capture=captures/wax sheet=check.png", "capture=captures/wax --json"),
+    "calibrate": ("capture=captures/cat chrome=captures/chrome", "capture=captures/cat response=debevec"),
     "demo": ("", "out=elsewhere"),
 }
 
