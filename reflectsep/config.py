@@ -58,6 +58,7 @@ class RigSettings:
     read_noise: float = setting(0.0, "standard deviation at black, of full scale", at_least=0.0, at_most=0.5)
     shot_noise: float = setting(0.0, "standard deviation at full scale, of full scale", at_least=0.0, at_most=0.5)
     bits: int | None = setting(None, "quantisation; null: none", at_least=4, at_most=16)
+    gamma: float | None = setting(None, "stored value = value ^ (1 / gamma); null: linear", above=0.0, at_most=10.0)
     headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
     drift_px: float = setting(0.0, "shift of the camera between a light's full picture and its sweep", at_least=0.0)
     drift_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)

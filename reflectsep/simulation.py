@@ -50,6 +50,7 @@ def rig_of(settings: RigSettings) -> SimulatedRig:
         read_sigma=settings.read_noise,
         full_well_e=full_well,
         bits=settings.bits,
+        gamma=settings.gamma,
     )
     return make_rig(
         settings.name,

@@ -46,7 +46,7 @@ STRUCTURE_PX = 3.0
 AGREE_PX = 0.35
 """Fine structure that moves apart from outline and shading by more than this is no texture."""
 CLIPPED_SHARE = 0.5
-CLIPPED_BESIDE = 0.02
+CLIPPED_BESIDE = 0.01
 DEGREE = 5
 
 
@@ -277,8 +277,9 @@ def _too_long(sweep: Sweep, added: SweepSum, mask: Tensor) -> list[str]:
     lit = added.clipped_frames[mask & added.clipped]
     if lit.numel() == 0:
         return []
-    # Most clipped pixels are clipped while lit alone; the slab's own width is their usual number.
-    share = float((added.clipped_frames[mask] > max(3.0, 1.5 * float(lit.quantile(0.25)))).double().mean())
+    # The faintest of the clipped pixels are clipped while lit alone.
+    usual = float(lit.kthvalue(max(1, round(0.05 * lit.numel()))).values)
+    share = float((added.clipped_frames[mask] > max(3.0, usual + 1.5)).double().mean())
     if share < CLIPPED_BESIDE:
         return []
     return [

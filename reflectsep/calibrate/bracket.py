@@ -18,6 +18,8 @@ from torch import Tensor
 
 from reflectsep.errors import CaptureError, MissingExtraError
 
+LAST = 245
+"""First code of the end of an 8-bit curve, where clipped values mix in."""
 NEARLY = 0.98
 """Of full scale: a value above it may be bent by the camera's shoulder, and counts as clipped in a bracket."""
 
@@ -79,9 +81,10 @@ def estimate_response(
     times = np.asarray(exposures_s, dtype=np.float32)
     solver = cv2.createCalibrateDebevec(samples=400) if method == "debevec" else cv2.createCalibrateRobertson()
     curve = np.asarray(solver.process(pictures, times=times), dtype=np.float64).reshape(256, 3).mean(1)
-    if not np.isfinite(curve).all() or curve[-1] <= 0:
+    known = np.isfinite(curve) & (curve > 0)
+    if known[10:-10].mean() < 0.5:
         raise CaptureError("response: the bracket gives no curve; expected pictures of one scene, from dark to clipped")
-    curve = _rising(curve)
+    curve = _rising(_ended(np.interp(np.arange(256), np.flatnonzero(known), curve[known])))
     return torch.linspace(0, 1, 256, dtype=torch.float64), torch.from_numpy(curve / curve[-1])
 
 
@@ -92,6 +95,15 @@ def fit_gamma(values: Float[Tensor, "rows"], radiances: Float[Tensor, "rows"]) -
     gamma = float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())
     scale = float((y - gamma * x).mean().exp())
     return gamma, float((scale * values[use] ** gamma - radiances[use]).abs().max())
+
+
+def _ended(curve: np.ndarray) -> np.ndarray:
+    """The last codes, which hold what is clipped, as the curve before them goes on (a power of the code)."""
+    before = np.arange(LAST - 30, LAST)
+    slope, height = np.polyfit(np.log(before), np.log(curve[before]), 1)
+    ended = curve.copy()
+    ended[LAST:] = np.exp(height + slope * np.log(np.arange(LAST, len(curve))))
+    return ended
 
 
 def _rising(curve: np.ndarray) -> np.ndarray:

@@ -20,8 +20,8 @@ from torch import Tensor
 from reflectsep.data import Vector
 from reflectsep.errors import LightError
 
-HIGHLIGHT = 0.9
-"""Of the ball's brightest value; a highlight is what is brighter, next to its brightest pixel."""
+HIGHLIGHT = 0.5
+"""Of the ball's brightest value; the highlight is the largest region above, each pixel weighing by how far."""
 FEWEST_RIM = 32
 HYPOTHESES = 400
 TOUCHING = 1.5
@@ -125,7 +125,7 @@ def highlight(picture: Float[Tensor, "height width"], circle: Circle) -> tuple[f
         raise LightError("chrome ball: dark, expected a highlight; was the light on?")
     bright = values >= HIGHLIGHT * most
     region = _largest(bright)
-    weight = torch.where(region, values, 0.0)
+    weight = torch.where(region, values - 0.99 * HIGHLIGHT * most, 0.0)
     y, x = torch.meshgrid(
         torch.arange(picture.shape[0], dtype=torch.float64),
         torch.arange(picture.shape[1], dtype=torch.float64),
@@ -254,10 +254,11 @@ def diffuse_lights(
         light = light / light.norm()
         shading = normals @ light
         use = seen & (shading > 0.15) & (picture < 0.999 * max(1e-12, float(pictures.max())))
-        n, values = normals[use], picture[use]
+        values = picture[use]
         strength = float((values * shading[use]).sum() / shading[use].square().sum())
         error = float((values - strength * shading[use]).norm() / values.norm())
-        free = torch.linalg.lstsq(n, values[:, None]).solution[:, 0]
+        lit = seen & (picture > 0.15 * float(picture[seen].max())) & (picture < 0.999 * float(picture.max()))
+        free = torch.linalg.lstsq(normals[lit], picture[lit][:, None]).solution[:, 0]
         x, y, z = (free / free.norm()).tolist()
         result.append(DiffuseSphere(light=name, intensity=strength, error=error, direction=(x, y, z)))
     return tuple(result)

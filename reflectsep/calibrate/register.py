@@ -555,13 +555,14 @@ def _step(
     gram = gram + 1e-9 * torch.eye(gram.shape[0], dtype=gram.dtype)
     step = -torch.linalg.solve(gram, unit.mT @ (w * error)) / scale
     inverse = torch.linalg.inv(gram)
-    plain = inverse * _noise_density(residual, weights, options)
+    density = max(_noise_density(residual, weights, options), 1e-30)
+    plain = inverse * density
     tile = _tile_index(level.weight, options.tiles).flatten()
     sums = torch.zeros(options.tiles**2, unit.shape[1], dtype=unit.dtype)
     sums.index_add_(0, tile, (w * error)[:, None] * unit)
     tiled = inverse @ (sums.mT @ sums) @ inverse
     # Tiles see what noise alone does not say, but a few that hold most of the outline are too few draws by themselves.
-    excess = float(torch.linalg.solve(plain, tiled).trace()) / len(plain)
+    excess = float((gram @ tiled).trace()) / density / len(plain)
     covariance = plain * max(1.0, excess) / (scale[:, None] * scale[None, :])
     return step, covariance
 
