@@ -139,7 +139,8 @@ def _response(
     gamma, error = fit_gamma(values, radiances)
     notes["response"] = {"method": job.response, "light": light, "exposures_s": exposures, "gamma": gamma}
     said.append(
-        f"  response from {len(codes)} exposures of {light} ({job.response}): like gamma {gamma:.3f}, within {error:.1%}"
+        f"  response from {len(codes)} exposures of {light} ({job.response}): like gamma {gamma:.3f}, "
+        f"within {error:.1%}"
     )
     rows = np.stack([values.numpy(), radiances.numpy()], 1)
     return tuple((float(v), float(r)) for v, r in rows)

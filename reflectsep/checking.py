@@ -1,4 +1,4 @@
-"""The check job: what a capture will bear, before anyone spends time on a fit. Each finding has a number and a verdict."""
+"""The check job: what a capture will bear, before anyone spends time on a fit; findings with numbers and verdicts."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ class CheckResult:
     @property
     def verdict(self) -> Verdict:
         """The worst of all."""
-        order: tuple[Verdict, ...] = ("good", "doubtful", "bad")
-        return max((f.verdict for f in self.findings), key=order.index)
+        verdicts = {finding.verdict for finding in self.findings}
+        return "bad" if "bad" in verdicts else ("doubtful" if "doubtful" in verdicts else "good")
 
     def document(self) -> dict[str, Any]:
         """For scripts."""
@@ -101,21 +101,14 @@ def check_capture(capture: Capture, progress: Progress = silent) -> CheckResult:
     streams: list[FrameStream] = [
         developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps
     ]
-    n_d = 1.0
-    for _ in range(2):
-        alignment = align(
-            capture, raw.names, pictures, saturated, mask, streams, options=AlignOptions(n_d=n_d), progress=progress
-        )
-        stack, lights = calibrate_stack(capture, minimum=3, alignment=alignment, condition_limit=math.inf)
-        still = [aligned_stream(stream, motion) for stream, motion in zip(streams, alignment.sweeps, strict=True)]
-        passages, gains, trouble = _pass(stack, still, progress)
+    seen = _seen(capture, raw, (pictures, saturated, mask), streams, 1.0, progress)
+    if seen.gains is not None and seen.gains.source == "estimated" and abs(seen.gains.n_d - 1) > ODD_N_D:
         # Of pictures that are not linear the sum of roots is the full picture, not the sum of frames.
-        if gains is None or gains.source != "estimated" or abs(gains.n_d - n_d) < ODD_N_D:
-            break
-        n_d = gains.n_d
-    findings = [_count(capture), *_pictures(capture, raw, stack), *_lights(capture, lights, stack)]
+        seen = _seen(capture, raw, (pictures, saturated, mask), streams, seen.gains.n_d, progress)
+    stack, alignment = seen.stack, seen.alignment
+    findings = [_count(capture), *_pictures(capture, raw, stack), *_lights(seen.lights, stack)]
     findings += _sweeps_there(capture)
-    findings += trouble + _sweeps(capture, stack, passages, gains)
+    findings += seen.trouble + _sweeps(capture, stack, seen.passages, seen.gains)
     findings += [
         Finding(
             subject="clipped scattering" if "cut off" in text else "registration",
@@ -133,8 +126,38 @@ def check_capture(capture: Capture, progress: Progress = silent) -> CheckResult:
         saturated=saturated,
         mask=mask,
         alignment=alignment,
-        passages=tuple(passages),
+        passages=tuple(seen.passages),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """A capture, aligned and passed over once."""
+
+    alignment: Alignment
+    stack: PhotometricStack
+    lights: AlphaReport
+    passages: list[Passage]
+    gains: Gains | None
+    trouble: list[Finding]
+
+
+def _seen(
+    capture: Capture,
+    raw: RawPictures,
+    developed: tuple[Tensor, Tensor, Tensor],
+    streams: Sequence[FrameStream],
+    n_d: float,
+    progress: Progress,
+) -> _Seen:
+    pictures, saturated, mask = developed
+    alignment = align(
+        capture, raw.names, pictures, saturated, mask, streams, options=AlignOptions(n_d=n_d), progress=progress
+    )
+    stack, lights = calibrate_stack(capture, minimum=3, alignment=alignment, condition_limit=math.inf)
+    still = [aligned_stream(stream, motion) for stream, motion in zip(streams, alignment.sweeps, strict=True)]
+    passages, gains, trouble = _pass(stack, still, progress)
+    return _Seen(alignment=alignment, stack=stack, lights=lights, passages=passages, gains=gains, trouble=trouble)
 
 
 def graded(value: float, limits: tuple[float, float]) -> Verdict:
@@ -179,7 +202,9 @@ def _pictures(capture: Capture, raw: RawPictures, stack: PhotometricStack) -> li
             )
         )
     noise = [fine_noise(picture, stack.mask) for picture in stack.images]
-    bright = float(stack.images[:, :, stack.mask].flatten().abs().topk(max(1, stack.mask.sum() // 100)).values.min())
+    bright = float(
+        stack.images[:, :, stack.mask].flatten().abs().topk(max(1, int(stack.mask.sum()) // 100)).values.min()
+    )
     share = max(noise) / max(bright, 1e-12)
     findings.append(
         Finding(
@@ -193,7 +218,7 @@ def _pictures(capture: Capture, raw: RawPictures, stack: PhotometricStack) -> li
     return findings
 
 
-def _lights(capture: Capture, lights: AlphaReport, stack: PhotometricStack) -> list[Finding]:
+def _lights(lights: AlphaReport, stack: PhotometricStack) -> list[Finding]:
     if lights.condition is None:
         return [
             Finding(
@@ -210,8 +235,8 @@ def _lights(capture: Capture, lights: AlphaReport, stack: PhotometricStack) -> l
     largest = float(lights.alpha.abs().max())
     verdict = graded(lights.condition, CONDITION)
     value = (
-        f"basis condition {lights.condition:.1f}; lights {float(tilt.min()):.0f} to {float(tilt.max()):.0f} degrees off "
-        f"the view, {inside} of {len(stack.names) - 3} inside the cone of the basis"
+        f"basis condition {lights.condition:.1f}; lights {float(tilt.min()):.0f} to {float(tilt.max()):.0f} degrees "
+        f"off the view, {inside} of {len(stack.names) - 3} inside the cone of the basis"
     )
     advice = "" if verdict == "good" else "choose basis lights further apart: basis=[A,B,C]"
     numbers = {"condition": lights.condition, "tilt_deg": tilt.tolist(), "largest_alpha": largest}
@@ -395,7 +420,7 @@ def _alignment(capture: Capture, alignment: Alignment) -> Finding:
 
 
 def _split(stack: PhotometricStack) -> Finding:
-    """What these lights and this noise leave uncertain of the split, for a typical lobe, at the object's own shading."""
+    """What these lights and this noise leave uncertain of a typical lobe, at the object's own shading."""
     noise = max(float(torch.tensor([fine_noise(picture, stack.mask) for picture in stack.images]).median()), 1e-9)
     values = stack.images.mean(1)[:, stack.mask].double().clamp_min(0)
     values = values[:, :: max(1, values.shape[1] // SPLIT_PIXELS)]

@@ -20,7 +20,7 @@ from reflectsep.flags import count
 from reflectsep.separation import Separation
 
 
-def describe(
+def describe(  # noqa: PLR0913  (every stage has its say)
     capture: Capture,
     stack: PhotometricStack,
     lights: AlphaReport,

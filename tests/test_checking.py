@@ -148,7 +148,7 @@ def test_command_writes_a_sheet_and_json_and_an_exit_code(good, tmp_path, capsys
     assert document["verdict"] == "good"
     assert document["alignment"]["reference"] == "L1"
     assert sheet.read_bytes().startswith(b"\x89PNG")
-    with pytest.raises(ResultError, match="sheet.png"):
+    with pytest.raises(ResultError, match=r"sheet\.png"):
         pipeline.run_check(CheckJob(capture=str(good), sheet=str(sheet)))
 
 

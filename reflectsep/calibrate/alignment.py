@@ -43,6 +43,8 @@ STRUCTURE_FLOOR_PX = 0.05
 """Systematic errors between pictures under different lights, beside which a motion must stand out: by outline and
 shading, and by texture."""
 STRUCTURE_PX = 3.0
+MOST_PIXELS = 100_000
+"""Pictures are halved until they are no larger: across lights a fifth of a pixel is the goal."""
 AGREE_PX = 0.35
 """Fine structure that moves apart from outline and shading by more than this is no texture."""
 CLIPPED_SHARE = 0.5
@@ -191,13 +193,13 @@ def across(
     """
     options = options or AlignOptions()
     usable = _grown(mask, MARGIN_PX)
-    models = tuple(m for m in options.models if m in ("identity", "translation", "rigid"))
+    models: tuple[Model, ...] = options.models[:3]  # up to a rigid motion
     try:
         outline = register(
             _outline(picture, mask),
             _polynomials(mask, 3),
             usable=usable,
-            options=RegisterOptions(models=("translation",), blur_px=OUTLINE_BLUR_PX),
+            options=RegisterOptions(models=("translation",), blur_px=OUTLINE_BLUR_PX, most_pixels=MOST_PIXELS),
         )
         shaded = partial(
             register,
@@ -207,11 +209,11 @@ def across(
             start=outline.matrix,
         )
         # Beyond a shift, what two lights do to an outline and to shading is more than a camera does.
-        measured = shaded(options=RegisterOptions(models=("translation",)))
+        measured = shaded(options=RegisterOptions(models=("translation",), most_pixels=MOST_PIXELS))
         structure = _structure(reference, picture, mask, models, measured)
         if structure is not None:
             return _judged(structure, mask)
-        tested = RegisterOptions(models=("identity", "translation"), floor_px=SHADING_FLOOR_PX)
+        tested = RegisterOptions(models=("identity", "translation"), floor_px=SHADING_FLOOR_PX, most_pixels=MOST_PIXELS)
         return _judged(shaded(options=tested), mask)
     except CaptureError as error:
         return Motion(reason=str(error))
@@ -232,7 +234,14 @@ def _structure(
         _fine(picture, mask),
         _fine(reference, mask)[None],
         usable=inner,
-        options=RegisterOptions(models=models, blur_px=1.0, floor_px=STRUCTURE_FLOOR_PX, lenient_turn=False, levels=0),
+        options=RegisterOptions(
+            models=models,
+            blur_px=1.0,
+            floor_px=STRUCTURE_FLOOR_PX,
+            lenient_turn=False,
+            levels=0,
+            most_pixels=MOST_PIXELS,
+        ),
         start=measured.matrix,
     )
     rows, columns = mask.nonzero(as_tuple=True)
@@ -283,8 +292,8 @@ def _too_long(sweep: Sweep, added: SweepSum, mask: Tensor) -> list[str]:
     if share < CLIPPED_BESIDE:
         return []
     return [
-        f"sweep of {sweep.light} along {sweep.direction}: {share:.0%} of the object is clipped in more frames than light "
-        "it, so scattering itself is cut off there: expose the frames shorter, or bracket them"
+        f"sweep of {sweep.light} along {sweep.direction}: {share:.0%} of the object is clipped in more frames than "
+        "light it, so scattering itself is cut off there: expose the frames shorter, or bracket them"
     ]
 
 

@@ -89,7 +89,7 @@ def estimate_response(
 
 
 def fit_gamma(values: Float[Tensor, "rows"], radiances: Float[Tensor, "rows"]) -> tuple[float, float]:
-    """Gamma of radiance = value^gamma, and the largest error of that curve (of full scale), on the upper nine tenths."""
+    """Gamma of radiance = value^gamma, and that curve's largest error (of full scale), on the upper nine tenths."""
     use = (values > 0.1) & (values < NEARLY)
     x, y = values[use].log(), radiances[use].log()
     gamma = float(((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum())

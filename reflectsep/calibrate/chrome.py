@@ -71,6 +71,7 @@ def find_circle(mask: Bool[Tensor, "height width"]) -> Circle:
     agree = (distance < TOUCHING).double().mean(1).nan_to_num(0.0)
     best = int(agree.argmax())
     near = distance[best] < TOUCHING
+    centre, radius, error = centres[best], radii[best], distance[best]
     for _ in range(5):
         centre, radius = _least_squares(points[near])
         error = (points - centre).norm(dim=1) - radius

@@ -1,4 +1,4 @@
-"""One stored picture to linear values: the camera's response undone, the dark picture subtracted, exposure made equal."""
+"""One stored picture to linear values: response undone, dark picture subtracted, exposure made equal."""
 
 from __future__ import annotations
 

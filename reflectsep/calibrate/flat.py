@@ -1,4 +1,4 @@
-"""Uneven light over the field: pictures of an even, matte, flat target under the same light, by which all is divided."""
+"""Uneven light over the field: all is divided by a picture of an even, matte target under the same light."""
 
 from __future__ import annotations
 

@@ -49,9 +49,11 @@ class RegisterOptions:
     """Along each side, for the evidence and the standard deviation."""
     evidence: float = 3.5
     """x of the bound P(chi^2_k >= k + 2 sqrt(k x) + 2 x) <= exp(-x) that a richer model must pass."""
+    unseen: float = 2.0
+    """Standard errors by which a motion must predict better what it was not fitted to."""
     floor_px: float = 0.01
     """Systematic error of a motion (interpolation) that is always allowed for."""
-    most_pixels: int = 2_000_000
+    most_pixels: int = 500_000
     """Larger pictures are halved until they are no larger; a twentieth of a pixel is seen there too."""
     noise_floor: float = 1e-3
     """Least residual, as a share of the picture's bright end, that is told from agreement."""
@@ -145,12 +147,12 @@ def register(
     finest = pyramid[-1]
     matrix = torch.eye(3, dtype=torch.float64) if start is None else _to_level(start.double(), finest.factor)
     matrix = _coarse(pyramid, matrix, options)
-    cameras = [model for model in options.models if model not in ("affine", "homography")]
+    cameras: list[Model] = [model for model in options.models if model not in ("affine", "homography")]
     candidates: list[tuple[Model, bool]] = [(model, False) for model in cameras]
     if options.drift:
         # Before affine: a drift along the sweep is a stretch, and the likelier reason for one.
-        candidates += [(model, True) for model in cameras if model != "identity"]
-    candidates += [(model, False) for model in options.models if model not in cameras]
+        candidates.extend((model, True) for model in cameras if model != "identity")
+    candidates.extend((model, False) for model in options.models if model not in cameras)
     return _choose(finest, matrix, candidates, usable, options)
 
 
@@ -182,7 +184,7 @@ def _choose(
     fall, significance = 0.0, 0.0
     if chosen != candidates[0]:
         fall, significance = _on_unseen(level, fits[candidates[0]], fits[chosen], candidates[0], chosen, options)
-        if not significance > 0:
+        if significance < options.unseen:
             chosen = candidates[0]
     state = fits[chosen]
     matrix = _from_level(state.matrix, level.factor)
@@ -518,7 +520,7 @@ def _columns(level: _Level, state: _State, moved: Tensor, model: Model, drifting
     slope = _slopes(moved[None], level.slope_blur_px)[0]
     mixed = torch.einsum("i,idhw->dhw", state.coefficients[:-1], level.slopes)
     gx, gy = 0.5 * (slope + mixed)
-    x, y, scale = _centred(level)
+    x, y, _ = _centred(level)
     parts: list[Tensor] = []
     if model != "identity":
         parts += [gx, gy]
@@ -547,8 +549,8 @@ def _step(
     columns: Tensor, residual: Tensor, weights: Tensor, level: _Level, options: RegisterOptions
 ) -> tuple[Tensor, Tensor]:
     """Gauss-Newton step, and the covariance of the unknowns with tiles as the independent draws."""
-    w = weights.flatten()
-    error = residual.flatten()
+    counts = weights.flatten() > 0
+    columns, w, error = columns[counts], weights.flatten()[counts], residual.flatten()[counts]
     scale = (columns.square() * w[:, None]).sum(0).sqrt().clamp_min(1e-30)
     unit = columns / scale
     gram = unit.mT @ (w[:, None] * unit)
@@ -557,7 +559,7 @@ def _step(
     inverse = torch.linalg.inv(gram)
     density = max(_noise_density(residual, weights, options), 1e-30)
     plain = inverse * density
-    tile = _tile_index(level.weight, options.tiles).flatten()
+    tile = _tile_index(level.weight, options.tiles).flatten()[counts]
     sums = torch.zeros(options.tiles**2, unit.shape[1], dtype=unit.dtype)
     sums.index_add_(0, tile, (w * error)[:, None] * unit)
     tiled = inverse @ (sums.mT @ sums) @ inverse

@@ -1,6 +1,7 @@
 """Entry point: find the job, build its settings, run it, and turn every foreseen error into one line.
 
-Exit codes: 0 done, 1 the data or the fit failed or a check found something bad, 2 the settings or the usage are wrong, 130 interrupted.
+Exit codes: 0 done, 1 the data or the fit failed or a check found something bad, 2 the settings or the usage are wrong,
+130 interrupted.
 Hydra and the pipeline are imported where they are used, so that `--help` answers at once.
 """
 

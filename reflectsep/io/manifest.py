@@ -123,9 +123,8 @@ def _picture(node: Node, lights: Mapping[str, Light]) -> Picture:
     light = node.optional("light", read.nullable(read.text), None)
     if kind == "dark" and light is not None:
         raise node.child("light").fail("no light in a dark picture")
-    if kind == "full":
-        if light is None:
-            raise CaptureError(f"{node.path}: {node.place}: a full picture needs its light")
+    if kind == "full" and light is None:
+        raise CaptureError(f"{node.path}: {node.place}: a full picture needs its light")
     if light is not None:
         _known_light(node.child("light"), lights)
     return Picture(
@@ -146,8 +145,8 @@ def _basis(node: Node, lights: Mapping[str, Light], images: tuple[Picture, ...])
         exposures = [picture.exposure_s for picture in images if picture.kind == "full" and picture.light == name]
         if len(exposures) > 1 and (None in exposures or len(set(exposures)) < len(exposures)):
             raise CaptureError(
-                f"{node.path}: images: light {name!r} has {len(exposures)} full pictures, expected one, or a bracket of "
-                "different exposure_s"
+                f"{node.path}: images: light {name!r} has {len(exposures)} full pictures, expected one, or a bracket "
+                "of different exposure_s"
             )
     for name in names:
         if name not in full:

@@ -1,4 +1,4 @@
-"""Camera raw files through rawpy (an extra): linear, in the camera's own colours, nothing white-balanced or brightened."""
+"""Camera raw files through rawpy (an extra): linear, in the camera's own colours, neither balanced nor brightened."""
 
 from __future__ import annotations
 

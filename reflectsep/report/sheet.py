@@ -25,7 +25,7 @@ COLOURS = {"good": "#2e7d32", "doubtful": "#b26a00", "bad": "#c62828"}
 """Of verdicts; the word is always written beside the colour."""
 
 
-def write_sheet(
+def write_sheet(  # noqa: PLR0913  (one drawing, told whole)
     path: Path | str,
     names: Sequence[str],
     pictures: Float[Tensor, "lights channels height width"],

@@ -191,7 +191,7 @@ def _require(holds: bool, found: str, expected: str) -> None:
         raise SettingsError(f"simulated camera: {found}, expected {expected}")
 
 
-def make_rig(
+def make_rig(  # noqa: PLR0913  (a rig by numbers)
     name: str,
     *,
     lights: int = 6,

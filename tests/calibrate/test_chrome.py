@@ -83,9 +83,9 @@ def test_a_square_is_no_ball():
     square[20:80, 20:80] = True
     with pytest.raises(LightError, match=r"of its outline lie on a circle; give circle=\[x,y,radius\]"):
         find_circle(square)
+    tiny = torch.zeros(9, 9, dtype=torch.bool)
+    tiny[3:5, 3:5] = True
     with pytest.raises(LightError, match="an outline of 4 pixels, expected at least 32"):
-        tiny = torch.zeros(9, 9, dtype=torch.bool)
-        tiny[3:5, 3:5] = True
         find_circle(tiny)
 
 
