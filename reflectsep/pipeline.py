@@ -275,6 +275,7 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     baseline = fit(
         capture,
         settings=recorded_settings(separation, job.result),
+        calibration=recorded_calibration(separation),
         heldout=heldout,
         progress=progress,
         scattering="none",
@@ -305,6 +306,12 @@ def recorded_settings(separation: Separation, result: str) -> FitSettings:
         return FitSettings(**separation.document["settings"]["fit"])
     except (KeyError, TypeError, SettingsError) as error:
         raise ResultError(f"{result}: separation.json has no usable settings.fit ({error})") from error
+
+
+def recorded_calibration(separation: Separation) -> CalibrationSettings:
+    """The calibration's settings that a result names; nothing corrected where it names none."""
+    given = separation.document.get("settings", {}).get("calibration")
+    return CalibrationSettings(registration="none") if given is None else CalibrationSettings(**given)
 
 
 def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001  (all jobs are called alike)

@@ -126,7 +126,7 @@ def test_a_run_leaves_nothing_of_its_own(ran, tmp_path):
         ("info", "no path: give path=..."),
         (
             "fti",
-            "fti: no such job; did you mean fit? (one of simulate, fit, relight, compare, info, check, calibrate, demo)",
+            f"fti: no such job; did you mean fit? (one of {', '.join(JOBS)})",
         ),
         ("fit --multrun", "--multrun: no such option; did you mean --multirun?"),
         ("fit -m object=wax,wux", "object=wux: no such option; did you mean wax?"),

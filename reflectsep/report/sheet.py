@@ -55,7 +55,8 @@ def write_sheet(  # noqa: PLR0913  (one drawing, told whole)
     figure = Figure(figsize=(COLUMNS * PANEL_IN, rows * (PANEL_IN + 0.35) + text_in + 0.5), dpi=DPI)
     height_in = figure.get_figheight()
     figure.text(0.01, 1 - 0.3 / height_in, title, fontsize=13, weight="bold")
-    axes = [_axes(figure, index, height_in) for index in range(len(names) + len(maps) + 1)]
+    axes = [_axes(figure, index, height_in) for index in range(len(names) + len(maps))]
+    axes.append(_axes(figure, len(axes), height_in, left=0.2))  # its scale needs room
     white = white_point([torch.nan_to_num(picture) for picture in pictures], mask)
     for axis, name, picture, clipped in zip(axes, names, pictures, saturated, strict=False):
         pixels = tone(picture, white=white)
@@ -126,13 +127,13 @@ def _middle_shift(motion: Mapping[str, Any], size: Sequence[int] | None) -> tupl
     return float(moved[0] / moved[2] - x), float(moved[1] / moved[2] - y)
 
 
-def _axes(figure: Figure, index: int, height_in: float) -> Axes:
+def _axes(figure: Figure, index: int, height_in: float, left: float = 0.0) -> Axes:
     row, column = divmod(index, COLUMNS)
     top_in = 0.75 + row * (PANEL_IN + 0.35)
     inset = 0.1
     return figure.add_axes(
         (
-            (column + inset / 2) / COLUMNS,
+            (column + inset / 2 + left) / COLUMNS,
             1 - (top_in + PANEL_IN * 0.92) / height_in,
             (1 - inset) / COLUMNS,
             PANEL_IN * 0.92 / height_in,
