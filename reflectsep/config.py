@@ -58,7 +58,13 @@ class RigSettings:
     read_noise: float = setting(0.0, "standard deviation at black, of full scale", at_least=0.0, at_most=0.5)
     shot_noise: float = setting(0.0, "standard deviation at full scale, of full scale", at_least=0.0, at_most=0.5)
     bits: int | None = setting(None, "quantisation; null: none", at_least=4, at_most=16)
+    gamma: float | None = setting(None, "stored value = value ^ (1 / gamma); null: linear", above=0.0, at_most=10.0)
     headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
+    drift_px: float = setting(0.0, "shift of the camera between a light's full picture and its sweep", at_least=0.0)
+    drift_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
+    drift_across_px: float = setting(0.0, "shift of the camera between the lights' full pictures", at_least=0.0)
+    drift_across_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
+    drift_within_px: float = setting(0.0, "shift of the camera from a sweep's first frame to its last", at_least=0.0)
 
     def __post_init__(self) -> None:
         check(self)
@@ -118,6 +124,25 @@ class ScatterSettings:
 
 
 @dataclass(kw_only=True)
+class CalibrationSettings:
+    """What is corrected before anything is measured."""
+
+    key: ClassVar[str] = "calibration."
+    registration: Literal["all", "same_light", "none"] = setting(
+        "all", "drift of the camera: of all pictures, of sweeps against their full pictures alone, or not looked for"
+    )
+    motion: Literal["translation", "rigid", "affine", "homography"] = setting(
+        "homography", "the richest motion that the evidence may choose"
+    )
+    file: str | None = setting(
+        None, "calibration to use; null: calibration.json in the capture's folder, where there is one", path=True
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
 class SimulateJob:
     """Write a simulated capture with its truth beside it."""
 
@@ -143,6 +168,7 @@ class FitJob:
     rig: RigSettings = field(default_factory=RigSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     scatter: ScatterSettings = field(default_factory=ScatterSettings)
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     capture: str = setting("", "capture folder, or pictures with a light list; default captures/NAME", path=True)
     out: str = setting("", "result folder to write; default results/NAME", path=True)
     overwrite: bool = setting(False, "replace what is there")
@@ -215,6 +241,46 @@ class InfoJob:
 
 
 @dataclass(kw_only=True)
+class CheckJob:
+    """Look at a capture before a fit: what is wrong with it, what can be expected, and what to do."""
+
+    key: ClassVar[str] = ""
+    capture: str = required("capture folder, or pictures with a light list", path=True)
+    lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
+    basis: list[str] | None = setting(None, "names of three basis lights; null: the capture's", length=3)
+    sheet: str | None = setting(None, "picture sheet to write (.png)", path=True)
+    json: bool = setting(False, "print JSON for scripts instead of a table; --json does the same")
+    overwrite: bool = setting(False, "replace a sheet that is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.sheet is not None and Path(self.sheet).suffix.lower() != ".png":
+            raise SettingsError(f"sheet={self.sheet}: must end in .png")
+
+
+@dataclass(kw_only=True)
+class CalibrateJob:
+    """Find the lights and the camera's response, once for a bench, and write them beside a capture."""
+
+    key: ClassVar[str] = ""
+    capture: str = required("capture folder, or pictures with a light list", path=True)
+    chrome: str | None = setting(None, "folder of pictures of a chrome ball, NAME.png a light", path=True)
+    circle: list[float] | None = setting(None, "the ball: x, y, radius in pixels; null: its mask, or found", length=3)
+    intensity: Literal["keep", "sphere", "pictures"] = setting(
+        "keep", "strengths of the lights: as listed, from a matte ball, or jointly from the pictures"
+    )
+    matte: str | None = setting(None, "folder of pictures of a matte ball of one colour", path=True)
+    response: Literal["keep", "debevec", "robertson"] = setting(
+        "keep", "the camera's curve: as the manifest says, or from a bracket of one light"
+    )
+    out: str | None = setting(None, "file to write; null: calibration.json in the capture's folder", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
 class DemoJob:
     """Simulate, fit, relight and compare a small object, to see the whole thing."""
 
@@ -230,7 +296,7 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | DemoJob
+Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | CheckJob | CalibrateJob | DemoJob
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
@@ -238,6 +304,8 @@ JOBS: dict[str, type[Job]] = {
     "relight": RelightJob,
     "compare": CompareJob,
     "info": InfoJob,
+    "check": CheckJob,
+    "calibrate": CalibrateJob,
     "demo": DemoJob,
 }
 

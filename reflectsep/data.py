@@ -38,9 +38,9 @@ class Light:
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A full picture (one light on) or a dark one (none)."""
+    """A full picture (one light on), a dark one (none), or a flat one (an even matte target in the object's place)."""
 
-    kind: Literal["full", "dark"]
+    kind: Literal["full", "dark", "flat"]
     file: str
     light: str | None = None
     exposure_s: float | None = None
@@ -80,6 +80,8 @@ class Encoding:
     """For kind `gamma`: value = radiance ** (1 / gamma)."""
     response: str | None = None
     """For kind `response`: a CSV of value, radiance rows inside the capture folder."""
+    table: tuple[tuple[float, float], ...] | None = None
+    """For kind `response`: those rows themselves, from a calibration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +107,7 @@ class Capture:
     def names(self) -> tuple[str, ...]:
         """Lights that have a full picture, the basis first, the others in the manifest's order."""
         others = [p.light for p in self.images if p.kind == "full" and p.light not in self.basis]
-        return (*self.basis, *(name for name in others if name is not None))
+        return (*self.basis, *dict.fromkeys(name for name in others if name is not None))
 
     @property
     def exposure_s(self) -> float | None:
@@ -113,7 +115,7 @@ class Capture:
         return self.full(self.basis[0]).exposure_s
 
     def full(self, light: str) -> Picture:
-        """The full picture under `light`.
+        """The full picture under `light`; of a bracket the first.
 
         Raises:
             KeyError: there is none.
@@ -122,6 +124,10 @@ class Capture:
             if picture.kind == "full" and picture.light == light:
                 return picture
         raise KeyError(light)
+
+    def bracketed(self, light: str) -> bool:
+        """Whether there are several exposures of `light`."""
+        return sum(p.kind == "full" and p.light == light for p in self.images) > 1
 
 
 @runtime_checkable

@@ -35,6 +35,8 @@ class Flag(IntFlag):
     """At least one picture disagrees beyond noise and was weighed down (cast shadow, inter-reflection)."""
     UNDEREXPOSED = 1 << 11
     """Below the noise floor in every basis picture."""
+    MOVED_OUT = 1 << 12
+    """Outside the frame of at least one picture once the camera's drift is undone; the pixel is not fitted."""
 
 
 def decode(value: int) -> list[str]:

@@ -6,6 +6,8 @@ load -> calibrate (stack, alpha) -> scatter (n_d, C, s) -> fit -> separate -> sa
 from __future__ import annotations
 
 import dataclasses
+import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,11 +16,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reflectsep import calibration as calibration_job
 from reflectsep import simulation
+from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
-from reflectsep.calibrate.stack import calibrate_stack, held_out_pictures, without
+from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
+from reflectsep.checking import check_capture, draw, table
 from reflectsep.comparison import compare_result
 from reflectsep.config import (
+    CalibrateJob,
+    CalibrationSettings,
+    CheckJob,
     CompareJob,
     DemoJob,
     FitJob,
@@ -32,12 +40,15 @@ from reflectsep.data import Capture, Light, PhotometricStack, Scattering
 from reflectsep.errors import ResultError, SettingsError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
+from reflectsep.io import calibration as calibration_file
 from reflectsep.io.capture import load_capture
 from reflectsep.io.files import refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
+from reflectsep.io.stack import read_full, read_mask
 from reflectsep.progress import Progress, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
+from reflectsep.report.sheet import motion_plot
 from reflectsep.report.tone import tone, white_point
 from reflectsep.scatter.measure import measure_scattering
 from reflectsep.scatter.options import ScatterOptions
@@ -53,6 +64,7 @@ def fit(
     *,
     settings: FitSettings | None = None,
     scatter: ScatterSettings | None = None,
+    calibration: CalibrationSettings | None = None,
     heldout: Sequence[str] = (),
     progress: Progress = silent,
     **changes: Any,
@@ -63,6 +75,7 @@ def fit(
         capture: from `load_capture`.
         settings: of the fit; the defaults where None.
         scatter: of the sweeps; the defaults where None.
+        calibration: of what is corrected first; the defaults where None.
         heldout: lights to leave out, to compare with later.
         progress: called as (stage, done, total).
         **changes: single settings of the fit by name, as in `fit(capture, scattering="none")`.
@@ -74,14 +87,20 @@ def fit(
         ReflectsepError: whatever makes the capture unfit, in one line that names the file.
     """
     settings, scatter = changed(settings or FitSettings(), changes), scatter or ScatterSettings()
+    calibration = calibration or CalibrationSettings()
     clock = Clock()
+    capture, used = with_calibration(capture, calibration.file)
     capture = without(capture, heldout)
     least = 8 if settings.scattering == "unknown" else 6
     progress("pictures", 0, 1)
-    stack, lights = calibrate_stack(capture, minimum=least)
+    alignment = None
+    if calibration.registration != "none":
+        alignment = alignment_of(capture, calibration, scatter, progress)
+        clock.lap("alignment")
+    stack, lights = calibrate_stack(capture, minimum=least, alignment=alignment)
     progress("pictures", 1, 1)
     clock.lap("pictures")
-    scattering = measure(capture, stack, settings, scatter, progress)
+    scattering = measure(capture, stack, settings, scatter, progress, alignment)
     clock.lap("scattering")
     fitted = fit_reflectance(stack, scattering, fit_options(settings), progress=progress)
     clock.lap("fit")
@@ -92,9 +111,16 @@ def fit(
         scattering,
         fitted,
         timings_s=clock.seconds,
-        settings={"fit": dataclasses.asdict(settings), "scatter": dataclasses.asdict(scatter)},
+        settings={
+            "fit": dataclasses.asdict(settings),
+            "scatter": dataclasses.asdict(scatter),
+            "calibration": dataclasses.asdict(calibration),
+        },
         heldout=heldout,
+        alignment=alignment,
     )
+    if used is not None:
+        document["calibration_file"] = used
     return separate(stack, scattering, fitted, document)
 
 
@@ -111,18 +137,41 @@ def changed(settings: FitSettings, changes: Mapping[str, Any]) -> FitSettings:
     return dataclasses.replace(settings, **changes)
 
 
+def alignment_of(
+    capture: Capture, calibration: CalibrationSettings, scatter: ScatterSettings, progress: Progress = silent
+) -> Alignment:
+    """Motions of a capture's pictures and sweeps."""
+    response = response_of(capture)
+    raw = read_full(capture)
+    pictures, saturated = develop_pictures(capture, raw, response)
+    streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
+    options = AlignOptions(
+        scope="all" if calibration.registration == "all" else "same_light",
+        richest=calibration.motion,
+        n_d=scatter.n_d or 1.0,
+    )
+    return align(
+        capture, raw.names, pictures, saturated, read_mask(capture), streams, options=options, progress=progress
+    )
+
+
 def measure(
-    capture: Capture, stack: PhotometricStack, settings: FitSettings, scatter: ScatterSettings, progress: Progress
+    capture: Capture,
+    stack: PhotometricStack,
+    settings: FitSettings,
+    scatter: ScatterSettings,
+    progress: Progress,
+    alignment: Alignment | None = None,
 ) -> Scattering | None:
     """Scattering from the sweeps; None where the capture has none or the fit wants none."""
     if not capture.sweeps or settings.scattering != "measured":
         return None
     response = response_of(capture)
-    streams = [
-        developed_stream(capture, open_sweep(capture, sweep), response)
-        for sweep in capture.sweeps
-        if sweep.light in stack.names
-    ]
+    streams = []
+    for i, sweep in enumerate(capture.sweeps):
+        if sweep.light in stack.names:
+            stream = developed_stream(capture, open_sweep(capture, sweep), response)
+            streams.append(stream if alignment is None else aligned_stream(stream, alignment.sweeps[i]))
     options = ScatterOptions(**dataclasses.asdict(scatter))
     return measure_scattering(stack, streams, options=options, progress=progress)
 
@@ -157,6 +206,8 @@ def previews(separation: Separation) -> dict[str, Tensor]:
         for part, stack in parts.items():
             pixels = torch.from_numpy(tone(stack[i], white=white)).permute(2, 0, 1)
             shown[f"{name}_{part}"] = pixels.float() / 255.0
+    if "alignment" in separation.document:
+        shown["alignment"] = motion_plot(separation.document["alignment"])
     return shown
 
 
@@ -172,7 +223,12 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
     separation = fit(
-        capture, settings=job.fit, scatter=job.scatter, heldout=tuple(job.heldout or ()), progress=progress
+        capture,
+        settings=job.fit,
+        scatter=job.scatter,
+        calibration=job.calibration,
+        heldout=tuple(job.heldout or ()),
+        progress=progress,
     )
     if job.lights_file is not None:
         document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}
@@ -219,6 +275,7 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     baseline = fit(
         capture,
         settings=recorded_settings(separation, job.result),
+        calibration=recorded_calibration(separation),
         heldout=heldout,
         progress=progress,
         scattering="none",
@@ -251,12 +308,55 @@ def recorded_settings(separation: Separation, result: str) -> FitSettings:
         raise ResultError(f"{result}: separation.json has no usable settings.fit ({error})") from error
 
 
+def recorded_calibration(separation: Separation) -> CalibrationSettings:
+    """The calibration's settings that a result names; nothing corrected where it names none."""
+    given = separation.document.get("settings", {}).get("calibration")
+    return CalibrationSettings(registration="none") if given is None else CalibrationSettings(**given)
+
+
 def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001  (all jobs are called alike)
     """Say what is in a capture or a result."""
     path = Path(job.path)
     if (path / "separation.json").is_file():
         return summary(load(path), full=True)
     return capture_summary(load_capture(path))
+
+
+class Report(str):
+    """Text to print, and the exit code of the command that prints it."""
+
+    __slots__ = ("exit_code",)
+    exit_code: int
+
+
+def run_check(job: CheckJob, progress: Progress = silent) -> Report:
+    """Look at a capture before a fit; the exit code is 1 where something is bad."""
+    if job.sheet is not None:
+        refuse_existing(Path(job.sheet), job.overwrite)
+    capture = load_capture(
+        job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
+    )
+    capture, _ = with_calibration(capture, None)
+    result = check_capture(capture, progress)
+    if job.sheet is not None:
+        draw(result, job.sheet)
+    text = json.dumps(result.document(), indent=1) if job.json else table(result, colour=sys.stdout.isatty())
+    report = Report(text)
+    report.exit_code = 1 if result.verdict == "bad" else 0
+    return report
+
+
+def run_calibrate(job: CalibrateJob, progress: Progress = silent) -> str:
+    """Find lights and response, and write them beside the capture."""
+    return calibration_job.calibrate(job, progress)
+
+
+def with_calibration(capture: Capture, file: str | None) -> tuple[Capture, str | None]:
+    """The capture with what a calibration file says, and which file that was."""
+    path = capture.folder / calibration_file.FILE if file is None else Path(file)
+    if file is None and not path.is_file():
+        return capture, None
+    return calibration_file.calibrated(capture, calibration_file.read_calibration(path)), str(path)
 
 
 def run_demo(job: DemoJob, progress: Progress = silent) -> str:

@@ -8,6 +8,7 @@ from reflectsep.config import RigSettings, SimulateJob
 from reflectsep.errors import SettingsError
 from reflectsep.io.files import refuse_folder
 from reflectsep.progress import Progress
+from reflectsep.synth.drift import Drift
 from reflectsep.synth.paper import PaperObject, paper_rig, simulate_paper
 from reflectsep.synth.presets import make_object
 from reflectsep.synth.rig import SimulatedCamera, SimulatedRig, make_rig
@@ -49,6 +50,7 @@ def rig_of(settings: RigSettings) -> SimulatedRig:
         read_sigma=settings.read_noise,
         full_well_e=full_well,
         bits=settings.bits,
+        gamma=settings.gamma,
     )
     return make_rig(
         settings.name,
@@ -59,4 +61,11 @@ def rig_of(settings: RigSettings) -> SimulatedRig:
         sweeps=(settings.sweeps, settings.sweeps if settings.orthogonal else 0),
         slab_px=(settings.slab_width_px, settings.slab_step_px),
         camera=camera,
+        drift=Drift(
+            between_px=settings.drift_px,
+            between_deg=settings.drift_deg,
+            across_px=settings.drift_across_px,
+            across_deg=settings.drift_across_deg,
+            within_px=settings.drift_within_px,
+        ),
     )

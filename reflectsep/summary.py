@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from reflectsep import __version__
+from reflectsep.calibrate.alignment import Alignment
 from reflectsep.calibrate.alpha import AlphaReport
 from reflectsep.calibrate.exposure import missing_darks
 from reflectsep.data import Capture, Fit, PhotometricStack, Scattering
@@ -19,7 +20,7 @@ from reflectsep.flags import count
 from reflectsep.separation import Separation
 
 
-def describe(
+def describe(  # noqa: PLR0913  (every stage has its say)
     capture: Capture,
     stack: PhotometricStack,
     lights: AlphaReport,
@@ -29,6 +30,7 @@ def describe(
     timings_s: Mapping[str, float],
     settings: Mapping[str, Mapping[str, Any]],
     heldout: Sequence[str],
+    alignment: Alignment | None = None,
 ) -> dict[str, Any]:
     """What `separation.json` says beside the globals."""
     residual = fitted.residual[..., stack.mask]
@@ -72,6 +74,9 @@ def describe(
         warnings.extend(scattering.warnings)
         document["n_d_sd"] = scattering.n_d_sd
         document["sweeps"] = [dataclasses.asdict(report) for report in scattering.sweeps]
+    if alignment is not None:
+        document["alignment"] = alignment.document(capture)
+        warnings.extend(alignment.warnings)
     if fitted.haze > 0 or fitted.softness > 0:
         document["extensions"] = "haze and soft shadow edges lowered the cost and were kept"
     document["warnings"] = warnings

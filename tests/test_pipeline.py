@@ -90,7 +90,9 @@ def test_document_says_how_it_came_about(result, captured):
     assert document["capture"] == str(captured.resolve())
     assert document["heldout"] == ["L7"]
     assert document["settings"]["fit"] == dataclasses.asdict(QUICK)
-    assert set(document["timings_s"]) == {"pictures", "scattering", "fit"}
+    assert set(document["timings_s"]) == {"alignment", "pictures", "scattering", "fit"}
+    assert document["alignment"]["reference"] == "L1"
+    assert not any(motion["applied"] for motion in document["alignment"]["pictures"].values())
     assert [sweep["light"] for sweep in document["sweeps"]] == ["L1", "L2", "L3"]
     assert document["versions"]["reflectsep"] == reflectsep.__version__
     assert list(document["lights"]) == ["L1", "L2", "L3", "L4", "L5", "L6"]

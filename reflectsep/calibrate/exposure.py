@@ -8,22 +8,21 @@ sweep's dark pixels would grow with the number of its frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reflectsep.calibrate.develop import Response, develop, gamma_response, linear_response, table_response
+from reflectsep.calibrate.flat import flat_of
 from reflectsep.data import Capture, Frame, FrameStream, Light, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io.files import inside
 from reflectsep.io.manifest import frame_file
 from reflectsep.io.response import read_response
 from reflectsep.io.stack import read_sweep_dark
-
-Response = Callable[[Tensor], Tensor]
-"""Stored values to values linear in radiance, of any shape."""
 
 
 def response_of(capture: Capture) -> Response:
@@ -38,60 +37,13 @@ def response_of(capture: Capture) -> Response:
             raise CaptureError(f"{capture.folder}: encoding gamma is {encoding.gamma}; expected a positive number")
         return gamma_response(encoding.gamma)
     if encoding.kind == "response":
+        if encoding.table is not None:
+            values, radiances = torch.tensor(encoding.table, dtype=torch.float64).unbind(1)
+            return table_response(values, radiances)
         if encoding.response is None:
             raise CaptureError(f"{capture.folder}: encoding names no response table; expected a CSV in the folder")
         return table_response(*read_response(inside(capture.folder, encoding.response)))
     return linear_response
-
-
-def linear_response(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The values as they are."""
-    return values
-
-
-def gamma_response(gamma: float) -> Response:
-    """sign(v) |v|^gamma, which undoes value = radiance^(1/gamma) and leaves noise round zero where it is."""
-    return lambda values: torch.sign(values) * values.abs() ** gamma
-
-
-def table_response(values: Float[Tensor, " rows"], radiances: Float[Tensor, " rows"]) -> Response:
-    """Linear interpolation in a table, its end segments drawn on beyond it.
-
-    Args:
-        values: stored values, strictly increasing, two or more.
-        radiances: what they stand for, strictly increasing.
-    """
-
-    def response(stored: Tensor) -> Tensor:
-        table, meaning = values.to(stored), radiances.to(stored)
-        left = (torch.searchsorted(table, stored.contiguous(), right=True) - 1).clamp(0, table.numel() - 2)
-        slope = (meaning[left + 1] - meaning[left]) / (table[left + 1] - table[left])
-        return meaning[left] + slope * (stored - table[left])
-
-    return response
-
-
-def develop(
-    values: Float[Tensor, "channels height width"],
-    response: Response,
-    dark: Float[Tensor, "channels height width"] | None,
-    ratio: float,
-) -> Float[Tensor, "channels height width"]:
-    """One stored picture in the capture's units, never clipped.
-
-    Args:
-        values: as stored.
-        response: the inverse response.
-        dark: picture without light of the same exposure, as stored; None where there is none.
-        ratio: exposure of the first basis picture over the picture's own.
-
-    Returns:
-        Linear values; NaN where `values` or `dark` are not finite.
-    """
-    radiance = response(values)
-    if dark is not None:
-        radiance = radiance - response(dark)
-    return radiance * ratio
 
 
 def exposure_ratio(capture: Capture, exposure_s: float | None) -> float:
@@ -129,6 +81,8 @@ class DevelopedStream:
     """Of the sweep; its colour is divided out."""
     where: str
     """Names the capture in errors."""
+    flat: Float[Tensor, "channels height width"] | None = None
+    """Uneven light over the field, divided out."""
 
     @property
     def sweep(self) -> Sweep:
@@ -149,6 +103,10 @@ class DevelopedStream:
             values = develop(frame.values, self.response, self.dark, self.ratio)
             colour = colour_of(self.light, shape[0])
             values = values if colour is None else values / colour.to(values)
+            if self.flat is not None:
+                if self.flat.shape != values.shape:
+                    raise CaptureError(f"{name}: {shape} (channels, height, width), its flat {tuple(self.flat.shape)}")
+                values = values / self.flat.to(values)
             bad = int((~torch.isfinite(values)).sum())
             if bad:
                 raise CaptureError(f"{name}: {bad} values are not finite numbers; expected none")
@@ -172,9 +130,11 @@ def developed_stream(capture: Capture, stream: FrameStream, response: Response |
         CaptureError: an unreadable dark picture or response table; while iterating, a frame with values that are not
             finite.
     """
+    response = response or response_of(capture)
     return DevelopedStream(
         stream=stream,
-        response=response or response_of(capture),
+        response=response,
+        flat=flat_of(capture, stream.sweep.light, response),
         dark=read_sweep_dark(capture, stream.sweep),
         ratio=exposure_ratio(capture, stream.sweep.exposure_s),
         light=capture.lights[stream.sweep.light],

@@ -9,13 +9,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reflectsep.calibrate.alignment import Alignment, covered
 from reflectsep.calibrate.alpha import CONDITION_LIMIT, AlphaReport, light_vector, solve_alpha
-from reflectsep.calibrate.exposure import Response, colour_of, develop, exposure_ratio, response_of
+from reflectsep.calibrate.bracket import NEARLY, merge
+from reflectsep.calibrate.develop import Response, develop
+from reflectsep.calibrate.exposure import colour_of, exposure_ratio, response_of
+from reflectsep.calibrate.flat import flat_of
 from reflectsep.calibrate.linear_combination import EstimateSettings
+from reflectsep.calibrate.motion import warp
 from reflectsep.data import Capture, PhotometricStack
 from reflectsep.errors import CaptureError, LightError
 from reflectsep.flags import Flag, mark
-from reflectsep.io.stack import RawPictures, read_dark, read_full, read_mask
+from reflectsep.io.stack import RawPictures, read_bracket, read_dark, read_full, read_mask
 from reflectsep.settings import nearest
 
 MINIMUM = 6
@@ -42,6 +47,7 @@ def calibrate_stack(
     minimum: int = MINIMUM,
     settings: EstimateSettings | None = None,
     condition_limit: float = CONDITION_LIMIT,
+    alignment: Alignment | None = None,
 ) -> tuple[PhotometricStack, AlphaReport]:
     """Read and develop the full pictures, and find every light's alpha.
 
@@ -55,6 +61,7 @@ def calibrate_stack(
         minimum: pictures that there must be.
         settings: of alpha from the pictures, n_d among them.
         condition_limit: largest condition number of the basis lights.
+        alignment: motions to undo, before anything else is made of the pictures.
 
     Returns:
         The stack: a pixel that is not finite somewhere is 0 throughout, flagged and out of the mask. And where the
@@ -72,10 +79,15 @@ def calibrate_stack(
         raise LightError(f"{capture.folder}: {found}, expected at least {minimum}")
     raw = read_full(capture)
     on_object = read_mask(capture)
-    images = develop_pictures(capture, raw, response_of(capture))
+    images, saturated = develop_pictures(capture, raw, response_of(capture))
+    raw = replace(raw, saturated=saturated)
+    _check_pictures(capture, images, torch.isfinite(images), on_object)
+    seen = torch.ones_like(on_object)
+    if alignment is not None and alignment.moved:
+        images, saturated, seen = _still(raw, images, alignment)
+        raw = replace(raw, saturated=saturated)
     finite = torch.isfinite(images)
-    _check_pictures(capture, images, finite, on_object)
-    valid = finite.all(1).all(0)
+    valid = finite.all(1).all(0) & seen
     mask = on_object & valid
     if not bool(mask.any()):
         raise CaptureError(f"{capture.folder}: no pixel of the object is finite in all {len(raw.names)} pictures")
@@ -86,7 +98,8 @@ def calibrate_stack(
     )
     flags = torch.zeros(on_object.shape, dtype=torch.int32)
     flags = mark(flags, ~on_object, Flag.OUTSIDE_MASK)
-    flags = mark(flags, on_object & ~valid, Flag.INVALID_INPUT)
+    flags = mark(flags, on_object & seen & ~valid, Flag.INVALID_INPUT)
+    flags = mark(flags, on_object & ~seen, Flag.MOVED_OUT)
     flags = mark(flags, mask & raw.saturated.any(1).any(0), Flag.SATURATED)
     view = torch.tensor(capture.view, dtype=torch.float32)
     stack = PhotometricStack(
@@ -100,6 +113,19 @@ def calibrate_stack(
         flags=flags,
     )
     return stack, report
+
+
+def _still(raw: RawPictures, images: Tensor, alignment: Alignment) -> tuple[Tensor, Tensor, Tensor]:
+    """Pictures with their motions undone, each resampled once; clipped values; and pixels that all of them have."""
+    still, clipped = [], []
+    for name, picture, saturated in zip(raw.names, images, raw.saturated, strict=True):
+        motion = alignment.pictures[name]
+        if motion.applied:
+            picture, moved, _ = warp(picture, motion.matrix, saturated)  # noqa: PLW2901
+            saturated = saturated if moved is None else moved  # noqa: PLW2901
+        still.append(picture)
+        clipped.append(saturated)
+    return torch.stack(still), torch.stack(clipped), covered(alignment, *images.shape[-2:])
 
 
 def held_out_pictures(
@@ -120,13 +146,13 @@ def held_out_pictures(
     if not names:
         raise LightError(f"{capture.folder}: no held-out lights named; expected at least one")
     wanted = {*names, capture.basis[0]}  # the first basis picture says which size and channels are expected
-    images = tuple(picture for picture in capture.images if picture.kind == "dark" or picture.light in wanted)
+    images = tuple(picture for picture in capture.images if picture.kind != "full" or picture.light in wanted)
     first = capture.basis[0]
     raw = read_full(replace(capture, images=images, basis=(first, first, first)))
-    pictures = develop_pictures(capture, raw, response_of(capture))
+    pictures, saturated = develop_pictures(capture, raw, response_of(capture))
     finite = torch.isfinite(pictures)
     order = [raw.names.index(name) for name in names]
-    return torch.where(finite, pictures, 0.0)[order], (raw.saturated | ~finite)[order]
+    return torch.where(finite, pictures, 0.0)[order], (saturated | ~finite)[order]
 
 
 def without(capture: Capture, drop: Sequence[str]) -> Capture:
@@ -139,34 +165,54 @@ def without(capture: Capture, drop: Sequence[str]) -> Capture:
     basis = [name for name in drop if name in capture.basis]
     if basis:
         raise LightError(f"{capture.folder}: light {basis[0]} is of the basis and cannot be left out; choose another")
-    images = tuple(picture for picture in capture.images if picture.kind == "dark" or picture.light not in drop)
+    images = tuple(picture for picture in capture.images if picture.kind != "full" or picture.light not in drop)
     return replace(capture, images=images)
 
 
 def develop_pictures(
     capture: Capture, raw: RawPictures, response: Response
-) -> Float[Tensor, "lights channels height width"]:
-    """Full pictures in the capture's units, coloured lights' intensity divided out; NaN where they are not finite.
+) -> tuple[Float[Tensor, "lights channels height width"], Bool[Tensor, "lights channels height width"]]:
+    """Full pictures in the capture's units, and which of their values are clipped.
+
+    Brackets are merged; flat fields and a coloured light's intensity are divided out; NaN where a value is not finite.
 
     Raises:
-        CaptureError: an unreadable dark picture, or an intensity that does not fit the channels.
+        CaptureError: an unreadable dark or flat picture, or an intensity that does not fit the channels.
     """
-    channels = raw.values.shape[1]
-    darks: dict[float | None, Tensor | None] = {}
-    pictures = []
-    for name, values, exposure_s in zip(raw.names, raw.values, raw.exposure_s, strict=True):
-        if exposure_s not in darks:
-            darks[exposure_s] = read_dark(capture, exposure_s)
-        dark = darks[exposure_s]
-        if dark is not None and dark.shape != values.shape:
-            raise CaptureError(
-                f"{capture.folder}: dark picture of {tuple(dark.shape)}, but {capture.full(name).file} is of "
-                f"{tuple(values.shape)} (channels, height, width)"
-            )
-        picture = develop(values, response, dark, exposure_ratio(capture, exposure_s))
-        colour = colour_of(capture.lights[name], channels)
-        pictures.append(picture if colour is None else picture / colour)
-    return torch.stack(pictures)
+    pictures, clipped = [], []
+    for name, values, saturated, exposure_s in zip(raw.names, raw.values, raw.saturated, raw.exposure_s, strict=True):
+        picture = _developed(capture, name, values, exposure_s, response)
+        if capture.bracketed(name):
+            picture, saturated = _merged(capture, name, values, response)  # noqa: PLW2901
+        colour = colour_of(capture.lights[name], raw.values.shape[1])
+        picture = picture if colour is None else picture / colour
+        flat = flat_of(capture, name, response)
+        pictures.append(picture if flat is None else picture / flat)
+        clipped.append(saturated)
+    return torch.stack(pictures), torch.stack(clipped)
+
+
+def _developed(
+    capture: Capture, name: str, values: Tensor, exposure_s: float | None, response: Response
+) -> Float[Tensor, "channels height width"]:
+    """One exposure in the capture's units."""
+    dark = read_dark(capture, exposure_s)
+    if dark is not None and dark.shape != values.shape:
+        raise CaptureError(
+            f"{capture.folder}: dark picture of {tuple(dark.shape)}, but {capture.full(name).file} is of "
+            f"{tuple(values.shape)} (channels, height, width)"
+        )
+    return develop(values, response, dark, exposure_ratio(capture, exposure_s))
+
+
+def _merged(capture: Capture, name: str, like: Tensor, response: Response) -> tuple[Tensor, Tensor]:
+    """A light's bracket as one picture."""
+    shots = read_bracket(capture, name, like)
+    pictures = [_developed(capture, name, values, exposure_s, response) for exposure_s, values, _ in shots]
+    # Only integer files have a full scale; of those the camera's shoulder is left out as well.
+    limited = any(bool(clipped.any()) for _, _, clipped in shots)
+    bad = [clipped | (values > NEARLY) if limited else clipped for _, values, clipped in shots]
+    return merge(pictures, bad, [exposure_s for exposure_s, _, _ in shots])
 
 
 def _check_names(capture: Capture, names: Sequence[str]) -> None:

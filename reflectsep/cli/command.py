@@ -1,6 +1,7 @@
 """Entry point: find the job, build its settings, run it, and turn every foreseen error into one line.
 
-Exit codes: 0 done, 1 the data or the fit failed, 2 the settings or the usage are wrong, 130 interrupted.
+Exit codes: 0 done, 1 the data or the fit failed or a check found something bad, 2 the settings or the usage are wrong,
+130 interrupted.
 Hydra and the pipeline are imported where they are used, so that `--help` answers at once.
 """
 
@@ -20,7 +21,14 @@ FAILED = 1
 USAGE = 2
 INTERRUPTED = 130
 
-_OPTIONS = {"-h": "help", "--help": "help", "-m": "multirun", "--multirun": "multirun", "--cfg": "cfg"}
+_OPTIONS = {
+    "-h": "help",
+    "--help": "help",
+    "-m": "multirun",
+    "--multirun": "multirun",
+    "--cfg": "cfg",
+    "--json": "json",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,6 +88,10 @@ def _dispatch(words: list[str]) -> int:
     if "help" in options:
         print(job_help(job))
         return 0
+    if "json" in options:
+        if job != "check":
+            raise SettingsError(f"--json: {job} has none, only check has")
+        overrides = [*overrides, "json=true"]
     from reflectsep.cli import runs
 
     if "cfg" in options:

@@ -20,6 +20,8 @@ EXAMPLES = {
     "relight": ("result=results/wax lights=lights.lp out=relit", "result=results/wax 'direction=[0.3,0.2,0.9]'"),
     "compare": ("result=results/wax out=compare.png",),
     "info": ("captures/wax", "results/wax"),
+    "check": ("capture=captures/wax", "capture=captures/wax sheet=check.png", "capture=captures/wax --json"),
+    "calibrate": ("capture=captures/cat chrome=captures/chrome", "capture=captures/cat response=debevec"),
     "demo": ("", "out=elsewhere"),
 }
 
@@ -65,6 +67,7 @@ jobs:
 options:
   -h, --help      this text; after a job, its settings
   -m, --multirun  KEY=A,B runs once for A and once for B; hydra/launcher=joblib runs them side by side
+  --json          of `check`: print JSON for scripts
   --cfg           print the settings of a job, do not run it
   --version
 

@@ -40,8 +40,7 @@ def single(job: str, words: Sequence[str]) -> int:
     """
     with hydra_ready():
         settings = settings_of(job, checked(job, words, sweeping=False))
-    _run(job, settings)
-    return 0
+    return _run(job, settings)
 
 
 def show(job: str, words: Sequence[str]) -> int:
@@ -95,19 +94,19 @@ def _task(job: str, keys: frozenset[str], config: DictConfig) -> int:
     varied = [override for override in hydra.overrides.task if override.split("=")[0] in keys]
     where = f"{' '.join(varied)}: " if varied else ""
     try:
-        _run(job, build(job, config), where, parallel="BasicLauncher" not in hydra.launcher["_target_"])
+        return _run(job, build(job, config), where, parallel="BasicLauncher" not in hydra.launcher["_target_"])
     except (ReflectsepError, OSError) as error:
         return complain(error, where)
-    return 0
 
 
-def _run(job: str, settings: Job, where: str = "", *, parallel: bool = False) -> None:
+def _run(job: str, settings: Job, where: str = "", *, parallel: bool = False) -> int:
     from reflectsep import pipeline
 
     with shown(where, parallel=parallel) as progress:
         text = getattr(pipeline, f"run_{job}")(settings, progress)
     if text:
         print(text, flush=True)
+    return getattr(text, "exit_code", 0)  # what a check says of the capture
 
 
 def _codes(batches: Any) -> Iterable[int]:

@@ -119,13 +119,13 @@ def _lights(node: Node) -> dict[str, Light]:
 
 def _picture(node: Node, lights: Mapping[str, Light]) -> Picture:
     node.object(KEYS["image"], ("kind", "file"))
-    kind = read.choice(node.child("kind"), ("full", "dark"))
+    kind = read.choice(node.child("kind"), ("full", "dark", "flat"))
     light = node.optional("light", read.nullable(read.text), None)
     if kind == "dark" and light is not None:
         raise node.child("light").fail("no light in a dark picture")
-    if kind == "full":
-        if light is None:
-            raise CaptureError(f"{node.path}: {node.place}: a full picture needs its light")
+    if kind == "full" and light is None:
+        raise CaptureError(f"{node.path}: {node.place}: a full picture needs its light")
+    if light is not None:
         _known_light(node.child("light"), lights)
     return Picture(
         kind=kind,
@@ -141,10 +141,12 @@ def _basis(node: Node, lights: Mapping[str, Light], images: tuple[Picture, ...])
     if len(names) != 3 or len(set(names)) != 3:
         raise node.fail("the names of three different lights")
     full = [picture.light for picture in images if picture.kind == "full"]
-    for name in full:
-        if full.count(name) > 1:
+    for name in dict.fromkeys(full):
+        exposures = [picture.exposure_s for picture in images if picture.kind == "full" and picture.light == name]
+        if len(exposures) > 1 and (None in exposures or len(set(exposures)) < len(exposures)):
             raise CaptureError(
-                f"{node.path}: images: light {name!r} has {full.count(name)} full pictures, expected one"
+                f"{node.path}: images: light {name!r} has {len(exposures)} full pictures, expected one, or a bracket "
+                "of different exposure_s"
             )
     for name in names:
         if name not in full:

@@ -1,4 +1,4 @@
-"""Pictures as (channels, height, width) tensors, whatever the file: EXR, and 8 or 16-bit PNG, TIFF and JPEG.
+"""Pictures as (channels, height, width) tensors, whatever the file: EXR, 8 or 16-bit PNG, TIFF and JPEG, camera raw.
 
 Values are as stored: nothing is linearised, integers are divided by the largest value that their type can hold.
 """
@@ -18,8 +18,11 @@ from torch import Tensor
 from reflectsep.errors import CaptureError
 from reflectsep.io.exr import read_channels, write_channels
 from reflectsep.io.files import atomic_write, sha256
+from reflectsep.io.raw import read_raw
 
-SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg")
+RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef")
+"""Of camera raw files, read through rawpy (an extra)."""
+SUFFIXES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", *RAW_SUFFIXES)
 """Of the files that `read_picture` reads, in lower case."""
 
 _PNG_END = b"IEND\xaeB`\x82"
@@ -52,6 +55,8 @@ def read_picture(
         require_checksum(path, checksum)
     if suffix == ".exr":
         return developed(path, _read_exr(path))
+    if suffix in RAW_SUFFIXES:
+        return read_raw(path)
     decode = {".png": _read_png, ".tif": _read_tiff, ".tiff": _read_tiff}.get(suffix, _read_jpeg)
     try:
         pixels = decode(path.read_bytes())

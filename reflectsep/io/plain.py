@@ -56,6 +56,26 @@ def load_plain(folder: Path, *, basis: Sequence[str] | None = None, lights_file:
     )
 
 
+def pictures_by_light(folder: Path, names: Sequence[str]) -> tuple[dict[str, str], str | None]:
+    """Picture of every light in a folder, `NAME.png` or `anything.NAME.png`, and the mask (`mask`, `anything.mask`).
+
+    Raises:
+        CaptureError: no such folder, or a light without a picture or with several.
+    """
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder")
+    present = sorted(path.name for path in _pictures(folder))
+    files = {}
+    for name in names:
+        found = [file for file in present if Path(file).stem == name or Path(file).stem.endswith(f".{name}")]
+        if len(found) != 1:
+            what = f"several pictures: {', '.join(found)}" if found else "no picture"
+            raise CaptureError(f"{folder}: light {name}: {what}; one called {name} or ANYTHING.{name} was expected")
+        files[name] = found[0]
+    masks = [file for file in present if Path(file).stem.lower().split(".")[-1] == "mask"]
+    return files, masks[0] if len(masks) == 1 else None
+
+
 def best_basis(lights: Mapping[str, Light]) -> tuple[str, str, str]:
     """The three lights whose unit directions have the smallest condition number; of equals, the first.
 

@@ -94,6 +94,31 @@ def read_sweep_dark(capture: Capture, sweep: Sweep) -> Float[Tensor, "channels h
     return _read(capture, sweep.dark, None)[0]
 
 
+def read_one(capture: Capture, file: str) -> Float[Tensor, "channels height width"]:
+    """A picture of the capture, as stored.
+
+    Raises:
+        CaptureError: it cannot be read, or has another size than the manifest says.
+    """
+    return _read(capture, file, None)[0]
+
+
+def read_bracket(
+    capture: Capture, light: str, like: Float[Tensor, "channels height width"]
+) -> list[tuple[float, Float[Tensor, "channels height width"], Bool[Tensor, "channels height width"]]]:
+    """Exposure, values as stored and clipped ones of every full picture of a light.
+
+    Raises:
+        CaptureError: one that cannot be read or has another size or number of channels than `like`.
+    """
+    found = []
+    for picture in capture.images:
+        if picture.kind == "full" and picture.light == light:
+            values, clipped = _read(capture, picture.file, like)
+            found.append((picture.exposure_s or 0.0, values, clipped))
+    return found
+
+
 def read_mask(capture: Capture) -> Bool[Tensor, "height width"]:
     """Where the object is: pixels of the mask above one half in any channel; everywhere when there is no mask.
 

@@ -142,7 +142,7 @@ def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tens
         full=full[sound].double(),
         instrument=_around(full, stack.mask)[sound].double(),
         sums=passage.sums[:, inside],
-        noise=_fine_noise(full, stack.mask),
+        noise=fine_noise(full, stack.mask),
     )
 
 
@@ -154,7 +154,7 @@ def _around(full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "he
     return torch.where(count > 0.5, values / count.clamp(min=0.5), full)
 
 
-def _fine_noise(full: Tensor, mask: Tensor) -> float:
+def fine_noise(full: Tensor, mask: Tensor) -> float:
     """Robust spread of what a 3 x 3 second difference leaves, on the object."""
     kernel = torch.tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
     detail = torch.nn.functional.conv2d(full[:, None], kernel[None, None].to(full), padding=1)[:, 0] / 6.0

@@ -22,6 +22,7 @@ from reflectsep.io.exr import write_channels
 from reflectsep.io.files import write_json
 from reflectsep.io.pictures import write_picture
 from reflectsep.synth.camera import exposed, noise, store, suffix
+from reflectsep.synth.drift import Pose, moved, pose
 from reflectsep.synth.objects import SimulatedObject
 from reflectsep.synth.rig import SimulatedRig
 
@@ -84,11 +85,11 @@ def write_capture(
     """
     camera, shape = rig.camera, next(iter(pictures.full.values())).shape
     _check(pictures)
+    poses = poses_of(rig, (shape[2], shape[1]), seed)
     for light in rig.lights:
         name = f"full/{light.name}"
-        picture = exposed(
-            camera, pictures.full[light.name], camera.full_exposure_s, sigma=camera.full_sigma, rng=noise(seed, name)
-        )
+        seen = moved(pictures.full[light.name], poses[name].matrix)
+        picture = exposed(camera, seen, camera.full_exposure_s, sigma=camera.full_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
     if camera.has_dark:
         _write_dark(rig, folder, "dark", camera.full_exposure_s, shape, seed)
@@ -96,14 +97,34 @@ def write_capture(
             _write_dark(rig, folder, "dark_sweep", camera.slab_exposure_s, shape, seed)
     write_picture(folder / "mask.png", pictures.mask[None].to(torch.float32))
     _write_truth(folder, rig, pictures)
+    if rig.drift.any:
+        write_json(folder / "truth" / "drift.json", {name: at.document() for name, at in poses.items()})
     total = sum(pictures.frame_counts)
     for done, frame in enumerate(frames):
-        name = frame_folder(*rig.sweeps[frame.sweep]) + f"/{frame.index:04d}"
-        picture = exposed(camera, frame.values, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
+        place = frame_folder(*rig.sweeps[frame.sweep])
+        name = f"{place}/{frame.index:04d}"
+        time = 2.0 * frame.index / max(1, pictures.frame_counts[frame.sweep] - 1) - 1.0
+        seen = moved(frame.values, poses[place].at(time))
+        picture = exposed(camera, seen, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
         if progress:
             progress("frames", done + 1, total)
     return write_manifest(folder, _manifest(folder, rig, pictures))
+
+
+def poses_of(rig: SimulatedRig, size: tuple[int, int], seed: int) -> dict[str, Pose]:
+    """Where the camera is in every full picture and sweep, by their names in the folder."""
+    first = rig.lights[0].name
+    poses = {
+        f"full/{light.name}": pose(rig.drift, f"full/{light.name}", seed=seed, size=size)
+        if light.name != first
+        else Pose(matrix=torch.eye(3, dtype=torch.float64))
+        for light in rig.lights
+    }
+    for light, axis in rig.sweeps:
+        name = frame_folder(light, axis)
+        poses[name] = pose(rig.drift, name, seed=seed, size=size, still=poses[f"full/{light}"])
+    return poses
 
 
 def frame_folder(light: str, axis: Literal["x", "y"]) -> str:

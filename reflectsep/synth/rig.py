@@ -20,6 +20,7 @@ from torch import Tensor
 
 from reflectsep.data import Light, Vector
 from reflectsep.errors import LightError, SettingsError
+from reflectsep.synth.drift import Drift
 
 MARGIN_FRAMES = 1
 """Frames before and after those that light anything."""
@@ -103,6 +104,7 @@ class SimulatedRig:
     sweep_y: tuple[str, ...] = ()
     """Lights whose slab also sweeps along y."""
     camera: SimulatedCamera = field(default_factory=SimulatedCamera)
+    drift: Drift = field(default_factory=Drift)
 
     def __post_init__(self) -> None:
         """Refuse lights that cannot carry the method and slabs that leave points unlit."""
@@ -189,7 +191,7 @@ def _require(holds: bool, found: str, expected: str) -> None:
         raise SettingsError(f"simulated camera: {found}, expected {expected}")
 
 
-def make_rig(
+def make_rig(  # noqa: PLR0913  (a rig by numbers)
     name: str,
     *,
     lights: int = 6,
@@ -199,6 +201,7 @@ def make_rig(
     sweeps: tuple[int, int] = (3, 0),
     slab_px: tuple[float, float] = (4.0, 2.0),
     camera: SimulatedCamera | None = None,
+    drift: Drift | None = None,
 ) -> SimulatedRig:
     """A rig by numbers: three basis lights 120 degrees apart, the others on a spiral around the view.
 
@@ -211,6 +214,7 @@ def make_rig(
         sweeps: Lights swept along x, and along y; the basis first.
         slab_px: Width and step of the slab.
         camera: The camera; a perfect one by default.
+        drift: How it moves between exposures; not at all by default.
 
     Raises:
         LightError: fewer than 3 lights, or more sweeps than lights.
@@ -236,6 +240,7 @@ def make_rig(
         sweep_x=tuple(names[: sweeps[0]]),
         sweep_y=tuple(names[: sweeps[1]]),
         camera=camera or SimulatedCamera(),
+        drift=drift or Drift(),
     )
 
 

@@ -158,12 +158,12 @@ def test_values_that_are_no_numbers(tmp_path):
 
 
 def test_unknown_missing_and_foreign_files(tmp_path):
-    (tmp_path / "x.cr2").write_bytes(b"raw")
+    (tmp_path / "x.psd").write_bytes(b"raw")
     (tmp_path / "x.png").write_bytes(b"GIF89a")
     tifffile.imwrite(tmp_path / "x.tif", np.zeros((4, 4), np.int32))
     tifffile.imwrite(tmp_path / "w.tif", np.zeros((4, 4), np.uint8), photometric="miniswhite")
     for name, message in {
-        "x.cr2": "suffix '.cr2'",
+        "x.psd": "suffix '.psd'",
         "none.png": "no such file",
         "x.png": "not a readable PNG",
         "x.tif": "int32",
