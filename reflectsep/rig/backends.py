@@ -104,4 +104,6 @@ def _backend(kind: Kind, name: Any, where: str) -> Any:
     for point in entry_points(group=ENTRY_POINTS):
         if point.name == f"{kind}.{name}":
             return point.load()
-    raise SettingsError(f"{where}._target_={name}: no such backend{nearest(str(name), known)} (one of {', '.join(known)})")
+    raise SettingsError(
+        f"{where}._target_={name}: no such backend{nearest(str(name), known)} (one of {', '.join(known)})"
+    )

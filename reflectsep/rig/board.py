@@ -234,9 +234,7 @@ class Board:
         if self._motion == 1 and not self._feed:
             return "error:22"
         base = self._planned if self._planned is not None else self.trace.at(self._now_s)
-        x, y, z = (
-            base[i] if a not in axes else axes[a] + (0.0 if absolute else base[i]) for i, a in enumerate("XYZ")
-        )
+        x, y, z = (base[i] if a not in axes else axes[a] + (0.0 if absolute else base[i]) for i, a in enumerate("XYZ"))
         self.motion_lines.append((self._now_s, str(dict(axes))))
         if self.settings[20] == 1 and not all(
             -self.settings[130 + i] - 1e-6 <= v <= 1e-6 for i, v in enumerate((x, y, z))
@@ -340,7 +338,7 @@ class Board:
             self.alarm(3, dead=False)
         locked, dead = self._state in ("Alarm", "Dead"), self._state == "Dead"
         self._clear()
-        self._state = "Alarm" if locked and self.settings[22] == 1 or moving else "Idle"
+        self._state = "Alarm" if (locked and self.settings[22] == 1) or moving else "Idle"
         self._out.append((self._now_s + 0.01, BANNER.encode()))
         if self._state == "Alarm":
             self._out.append((self._now_s + 0.011, b"[MSG:'$H'|'$X' to unlock]\r\n"))

@@ -19,9 +19,7 @@ def checked_arguments(given: object, where: str) -> tuple[str, ...]:
     return tuple(str(word) for word in given)
 
 
-def run_command(
-    arguments: Sequence[str], values: Mapping[str, str], timeout_s: float, error: type[RigError]
-) -> str:
+def run_command(arguments: Sequence[str], values: Mapping[str, str], timeout_s: float, error: type[RigError]) -> str:
     """Run a program and return what it printed.
 
     Args:

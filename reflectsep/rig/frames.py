@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from reflectsep.errors import CameraError, CaptureError
 from reflectsep.io.files import atomic_write
 from reflectsep.io.pictures import SUFFIXES, read_picture, write_picture
 from reflectsep.rig.devices import RawFrame
+from reflectsep.rig.exposure import Brightness
 from reflectsep.rig.session import Session
 from reflectsep.rig.sync import unwrap
 
@@ -57,6 +57,7 @@ class FrameStore:
         self.size = size
         self.channels: int | None = None
         self.stored: list[Stored] = []
+        self.brightest: Brightness | None = None
         self._preview_s = -PREVIEW_EVERY_S
 
     def add(self, frame: RawFrame) -> np.ndarray | None:
@@ -189,8 +190,3 @@ def _codes(pixels: np.ndarray, largest: int) -> np.ndarray:
         pixels = np.rint(np.minimum(pixels, largest) * (full / largest)).astype(pixels.dtype)
     planes = pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)
     return np.array(planes, order="C", copy=True)
-
-
-def as_json(value: object) -> object:
-    """Numpy numbers and arrays as JSON has them."""
-    return json.loads(json.dumps(value, default=lambda item: item.tolist()))

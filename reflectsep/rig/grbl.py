@@ -46,7 +46,7 @@ class GrblStage:
         opener: Opens the port.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (one argument a setting of the configuration)
         self,
         *,
         port: str,

@@ -9,7 +9,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 
-class Interrupted(KeyboardInterrupt):  # noqa: N818  (it is an interrupt, as its base is)
+class Interrupted(KeyboardInterrupt):
     """Somebody wants the session to stop."""
 
 

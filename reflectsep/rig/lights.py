@@ -30,7 +30,7 @@ class SerialLights:
         opener: Opens the port.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (one argument a setting of the configuration)
         self,
         *,
         port: str,

@@ -16,7 +16,7 @@ from reflectsep.io.exr import write_channels
 from reflectsep.progress import Progress, silent
 from reflectsep.rig.clock import Clock, HostClock
 from reflectsep.rig.devices import Axis, Devices, RawFrame
-from reflectsep.rig.exposure import brightness, find_exposure, warning
+from reflectsep.rig.exposure import Brightness, brightness, find_exposure, warning
 from reflectsep.rig.frames import FrameStore
 from reflectsep.rig.guard import Guard, Interrupted
 from reflectsep.rig.plan import Exposure, Plan, SlabSweep, Still, check_plan, estimate
@@ -27,6 +27,8 @@ EXPOSURE_TOLERANCE = 0.02
 STALL_MM = 0.2
 """Slip of the carriage over a sweep above which its motor has stalled; homing is timed to about 0.1 mm."""
 WARNINGS_A_STEP = 3
+TRIES = 3
+"""At a picture that comes damaged."""
 SPACE_SPARE = 1.2
 IDLE_S = 0.005
 
@@ -39,7 +41,7 @@ class RunOptions:
     zeroed: bool = False
     """A person has put the carriage of a stage without switches at its zero before going on."""
     latency_s: float = 0.0
-    """From the middle of an exposure to the arrival of its frame at the earliest, for cameras whose clock cannot be read."""
+    """From mid-exposure to the earliest arrival of a frame, for cameras whose clock cannot be read."""
     frame_bytes: int = 0
     """Of one stored frame at most, to see whether the disk has room; 0: not looked at."""
 
@@ -131,9 +133,9 @@ class Runner:
         said = self.devices.lights.switch(light)
         self.session.event("light", asked=light or "off", read_back=said)
 
-    def look(self, what: str, values: np.ndarray, exposure_s: float | None, *, slab: bool) -> None:
+    def look(self, what: str, seen: Brightness, exposure_s: float | None, *, slab: bool) -> None:
         """Warn where a picture is clipped or too dark."""
-        text = warning(what, exposure_s, brightness(values), slab=slab)
+        text = warning(what, exposure_s, seen, slab=slab)
         if text is not None:
             self.warn(text)
 
@@ -217,7 +219,7 @@ class Runner:
             if values is None:
                 raise CameraError(f"{shot.name}: {store.stored[-1].fault}")
             pictures.append(values)
-        self.look(f"picture {shot.name}", pictures[-1], exposure, slab=False)
+        self.look(f"picture {shot.name}", brightness(pictures[-1]), exposure, slab=False)
         self.switch(None)
         if shot.kind == "full":
             file = store.stored[0].file
@@ -231,12 +233,12 @@ class Runner:
 
     def _whole(self, name: str) -> RawFrame:
         """A picture, tried again where it came damaged."""
-        for _ in range(3):
+        for _ in range(TRIES - 1):
             frame = self.devices.camera.snap(name)
             if frame.fault is None:
                 return frame
             self.warn(f"{name}: {frame.fault}; taken again")
-        return frame
+        return self.devices.camera.snap(name)
 
     def _find_exposures(self) -> None:
         """Exposures of the plan, those of an earlier part of this session, or by test pictures."""

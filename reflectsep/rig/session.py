@@ -88,7 +88,9 @@ class Session:
         """
         fresh = json.loads(json.dumps(what))
         known = self._document.get("made_by")
-        if known is None:
+        if known is None or (known != fresh and not self._document["steps"]):
+            # Nothing has been taken yet: another setup is no contradiction.
+            self._document.pop("exposures", None)
             self._document["made_by"] = fresh
             self._document["created"] = datetime.now(UTC).isoformat(timespec="seconds")
             self._save()

@@ -12,6 +12,7 @@ import numpy as np
 from reflectsep.errors import CameraError, StageError
 from reflectsep.rig.clock import Deadline
 from reflectsep.rig.devices import AxisLimits, ClockReading, RawFrame, StageReport
+from reflectsep.rig.exposure import brightness
 from reflectsep.rig.frames import FrameStore, Slot, row
 from reflectsep.rig.plan import LEAD_FRAMES, SlabSweep, run
 from reflectsep.rig.sync import Line, fit_clock, fit_track, place
@@ -146,10 +147,17 @@ def _keep(
                 fault=frame.fault,
             )
         )
-        # Ramp frames and frames beside the object are dark by nature: only every later one says something.
-        inside = 0.3 * shot.frames < len(recording.frames) < 0.8 * shot.frames
         if values is not None:
-            runner.look(f"{shot.name}, frame {len(store.stored)}", values, exposure, slab=inside)
+            _judge(runner, shot, store, exposure, values)
+
+
+def _judge(runner: Runner, shot: SlabSweep, store: FrameStore, exposure: float | None, values: np.ndarray) -> None:
+    """Warn of a saturated frame, and past the middle of the sweep when no frame so far was bright enough."""
+    seen = brightness(values)
+    store.brightest = seen if store.brightest is None or seen.high > store.brightest.high else store.brightest
+    runner.look(f"{shot.name}, frame {len(store.stored)}", seen, exposure, slab=False)
+    if len(store.stored) == int(0.6 * shot.frames) + 1:
+        runner.look(f"{shot.name}, its brightest frame so far", store.brightest, exposure, slab=True)
 
 
 def _assemble(
@@ -238,8 +246,7 @@ def _take_steps(
         values = store.add(runner.devices.camera.snap(f"{shot.name}/{index}"))
         if values is None:
             raise CameraError(f"{shot.name}, frame {index}: {store.stored[-1].fault}")
-        inside = 0.3 * shot.frames < index < 0.8 * shot.frames
-        runner.look(f"{shot.name}, frame {index}", values, exposure, slab=inside)
+        _judge(runner, shot, store, exposure, values)
         chosen.append(Slot(file=store.stored[-1].file, time_s=runner.clock.now() - began))
         positions.append(target)
         times.append(runner.clock.now() - began)

@@ -35,11 +35,11 @@ class Line:
     rms: float
 
     def at(self, t: np.ndarray) -> np.ndarray:
-        """y at t."""
+        """The ordinate at t."""
         return self.value + self.slope * (t - self.centre)
 
     def sd_at(self, t: np.ndarray) -> np.ndarray:
-        """Standard deviation of y at t."""
+        """Standard deviation of the ordinate at t."""
         return np.hypot(self.value_sd, self.slope_sd * (t - self.centre))
 
 
@@ -98,7 +98,9 @@ def _weighted(t: np.ndarray, y: np.ndarray, w: np.ndarray) -> tuple[float, float
     return float(slope), float(mean_y - slope * mean_t)
 
 
-def fit_track(reports: Sequence[StageReport], cruise_mm: tuple[float, float], speed_mm_s: float, step_mm: float) -> Track:
+def fit_track(
+    reports: Sequence[StageReport], cruise_mm: tuple[float, float], speed_mm_s: float, step_mm: float
+) -> Track:
     """The line of a sweep's motion, and whether the motion was what was asked for.
 
     Args:
@@ -215,9 +217,7 @@ def place(device_time_s: np.ndarray, clock: Line, track: Track, step_mm: float) 
     host = clock.at(device_time_s)
     position = track.line.at(host)
     clock_sd = clock.sd_at(device_time_s)
-    sd = np.sqrt(
-        track.line.sd_at(host) ** 2 + (track.line.slope * clock_sd) ** 2 + (step_mm / math.sqrt(12)) ** 2
-    )
+    sd = np.sqrt(track.line.sd_at(host) ** 2 + (track.line.slope * clock_sd) ** 2 + (step_mm / math.sqrt(12)) ** 2)
     return Placed(position_mm=position, sd_mm=sd, time_s=host)
 
 
