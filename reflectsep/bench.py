@@ -33,7 +33,7 @@ from reflectsep.rig.runner import Runner, RunOptions
 from reflectsep.rig.session import Session
 from reflectsep.rig.simulated import Bench, View
 from reflectsep.simulation import rig_of
-from reflectsep.synth.camera import encoded, exposed
+from reflectsep.synth.camera import encoded, exposed, noise
 from reflectsep.synth.objects import SimulatedObject
 from reflectsep.synth.presets import make_object
 from reflectsep.synth.rig import SimulatedRig, slab_coordinate
@@ -246,7 +246,8 @@ class SynthScene:
         else:
             patches = torch.from_numpy(self._slab(view.light, view.slit, view.blur_mm))
         values = self._obj.picture(self._scale * patches)
-        rng = np.random.default_rng(view.seed)
+        # A full picture has the noise that the simulator gives it: a capture differs from it by what the rig does.
+        rng = noise(0, f"full/{view.light}" if view.name == f"full-{view.light}" else view.name)
         seen = encoded(camera, exposed(camera, values, view.exposure_s, sigma=0.0, rng=rng))
         codes = np.rint(seen.clamp(0, 1).numpy() * self.largest)
         codes = codes.astype(np.uint8 if self.largest <= 255 else np.uint16)

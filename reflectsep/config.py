@@ -52,7 +52,7 @@ class SweepSettings:
     )
     park_mm: float = setting(-1.0, "where the slit is out of the light, for full pictures")
     motion: Literal["continuous", "stepped"] = setting("continuous", "frames on the way, or at rest one by one")
-    dark_frames: int = setting(4, "dark pictures averaged, for each exposure; 0: none", at_least=0, at_most=256)
+    dark_frames: int = setting(16, "dark pictures averaged, for each exposure; 0: none", at_least=0, at_most=256)
     max_lost: float = setting(0.05, "share of a sweep's frames that may be lost", at_least=0.0, at_most=0.5)
     latency_s: float = setting(
         0.0, "from mid-exposure to the earliest arrival, where the camera's clock cannot be read", at_least=0.0

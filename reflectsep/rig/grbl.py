@@ -65,6 +65,9 @@ class GrblStage:
         self._clock = clock or HostClock()
         self._link = SerialLink(port, baud, self._clock, opener)
         self._axes = stage_axes(axes, "stage")
+        for name, axis in self._axes.items():
+            if axis.letter not in ("X", "Y", "Z"):
+                raise SettingsError(f"stage.axes.{name}.letter={axis.letter}: expected X, Y or Z")
         self._boot_s, self._command_s, self._homing_s = boot_timeout_s, command_timeout_s, homing_timeout_s
         self._reference = reference
         self._check_mm = check_mm

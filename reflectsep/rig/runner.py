@@ -215,7 +215,7 @@ class Runner:
         exposure = self.set_exposure(shot.exposure)
         pictures = []
         for index in range(shot.frames):
-            values = store.add(self._whole(f"{shot.name}/{index}"))
+            values = store.add(self._whole(shot.name if shot.frames == 1 else f"{shot.name}/{index}"))
             if values is None:
                 raise CameraError(f"{shot.name}: {store.stored[-1].fault}")
             pictures.append(values)

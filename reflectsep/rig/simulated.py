@@ -6,7 +6,6 @@ on and the place where the slit really is in the middle of each exposure.
 
 from __future__ import annotations
 
-import zlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -58,7 +57,8 @@ class View:
     """Axis and position in mm; None: the slit is out of the light."""
     blur_mm: float = 0.0
     """Way of the slit during the exposure."""
-    seed: int = 0
+    name: str = ""
+    """Of the picture: its noise is drawn from it."""
 
 
 @dataclass(kw_only=True)
@@ -260,7 +260,7 @@ class SimulatedCamera:
             exposure_s=self._exposure_s,
             slit=None if slit is None else slit[:2],
             blur_mm=0.0 if slit is None else slit[2] * self._exposure_s,
-            seed=zlib.crc32(f"{name}/{index}".encode()),
+            name=name if self._taking is None else f"{name}/{index}",
         )
         last = 65535
         return RawFrame(

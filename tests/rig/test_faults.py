@@ -13,11 +13,13 @@ import termios
 import numpy as np
 import pytest
 import serial
-from .conftest import NAMES, complete, whole
 
 from reflectsep.errors import ReflectsepError, SettingsError
 from reflectsep.rig import session as session_module
+from reflectsep.rig.backends import build
 from reflectsep.rig.session import Session, read_events
+
+from .conftest import NAMES, complete, whole
 
 
 def at_sweep(rig, poll, action):
@@ -411,7 +413,7 @@ def test_what_the_stage_cannot_do_is_refused_before_anything_moves(sweep, settin
 def test_a_slow_sweep_that_the_board_runs_too_fast_is_noticed(rig_in):
     rig = rig_in(sweep={"speed_mm_s": 0.13, "start_mm": -60.5, "end_mm": -60.0, "rate_hz": 5.0})
     rig.bench.board._true_speed = lambda speed: speed * 1.22 if speed < 1 else speed
-    with pytest.raises(ReflectsepError, match="more than 0.5 % off"):
+    with pytest.raises(ReflectsepError, match=r"more than 0\.5 % off"):
         rig.run()
 
 
@@ -544,8 +546,6 @@ def test_read_only_folder_says_so(tmp_path, rig_in, record_fault, monkeypatch):
 
 def test_plan_names_what_it_refuses():
     with pytest.raises(SettingsError, match=r"rig.devices.stage._target_=os.system: no such backend"):
-        from reflectsep.rig.backends import build
-
         build("stage", {"_target_": "os.system"})
 
 
