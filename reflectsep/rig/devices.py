@@ -167,6 +167,8 @@ class CameraLimits:
     """Last count before it wraps to the first."""
     streams: bool = True
     """Whether it takes frames by itself at a steady rate; else one at a time, on request."""
+    host_times: bool = True
+    """Whether frames say when they arrived; else only what they show ties their clock to the session's."""
 
 
 class Camera(Protocol):

@@ -32,6 +32,8 @@ class Stored:
     device_time_s: float | None
     host_time_s: float | None
     fault: str | None
+    level: float | None = None
+    """Mean value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +85,7 @@ class FrameStore:
                 device_time_s=frame.device_time_s,
                 host_time_s=frame.host_time_s,
                 fault=fault,
+                level=None if values is None else float(values.mean()),
             )
         )
         facts = {"sequence": frame.sequence, "device_time_s": frame.device_time_s, "host_time_s": frame.host_time_s}
@@ -161,7 +164,12 @@ def row(stored: Sequence[Stored], *, first: int, last: int | None, period_s: flo
     present = sorted(slots)
     known = np.array([slots[n].time_s for n in present])
     if (np.diff(known) <= 0).any():
-        raise CameraError("the camera's times do not rise with its count of frames")
+        if any(s.device_time_s is not None for s in timed):
+            raise CameraError("the camera's times do not rise with its count of frames")
+        # Arrivals out of order say little: the frames are as even as their count.
+        known = known[0] + period_s * (np.array(present) - present[0])
+        known += float(np.median(np.array([slots[n].time_s for n in present]) - known))
+        slots = {n: Slot(file=slots[n].file, time_s=float(t)) for n, t in zip(present, known, strict=True)}
     everything = range(present[0], present[-1] + 1)
     filled = np.interp(np.array(everything), np.array(present), known)
     return [slots.get(n, Slot(file=None, time_s=float(t))) for n, t in zip(everything, filled, strict=True)]

@@ -14,6 +14,7 @@ from reflectsep.rig.clock import Deadline
 from reflectsep.rig.devices import AxisLimits, ClockReading, RawFrame, StageReport
 from reflectsep.rig.exposure import brightness
 from reflectsep.rig.frames import FrameStore, Slot, row
+from reflectsep.rig.marks import Switched, clock_of_marks
 from reflectsep.rig.plan import LEAD_FRAMES, SlabSweep, run
 from reflectsep.rig.sync import Line, fit_clock, fit_track, place
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from reflectsep.rig.runner import Runner
 
 LOOP_S = 0.004
+MARK_FRAMES = 4
+"""Before and after each switching of the light that a camera's clock is found by."""
 CLOCK_EVERY_S = 0.2
 DRIFT = 0.005
 """Relative change of the exposure over a sweep that is still none."""
@@ -47,6 +50,9 @@ class Recording:
     readings: list[ClockReading]
     frames: list[RawFrame]
     """Times only: the pixels are on disk."""
+    on_s: float = 0.0
+    off_s: float = 0.0
+    """When the light was switched, for cameras whose frames alone can tell."""
 
 
 def take_sweep(
@@ -72,7 +78,8 @@ def take_sweep(
     # From the same side always: the backlash of the screw is taken up before the run-up begins.
     runner.move(shot.axis, max(first - 0.5, limits.travel_mm[0]))
     runner.move(shot.axis, first)
-    runner.switch(shot.light)
+    marked = not runner.devices.camera.limits.host_times
+    runner.switch(None if marked else shot.light)
     exposure = runner.set_exposure("slab")
     if shot.motion == "stepped":
         taken = _take_steps(runner, shot, store, exposure, progress)
@@ -113,6 +120,10 @@ def _record(
 
     camera.start(shot.name, shot.rate_hz)
     _idle(runner, drain, LEAD_FRAMES / shot.rate_hz + 0.2)
+    if not camera.limits.host_times:
+        _idle(runner, drain, MARK_FRAMES / shot.rate_hz)
+        recording.on_s = _switched(runner, shot.light)
+        _idle(runner, drain, MARK_FRAMES / shot.rate_hz)
     stage.begin(shot.axis, last_mm, shot.speed_mm_s)
     while stage.moving:
         report = stage.poll()
@@ -122,8 +133,18 @@ def _record(
         drain()
         clock.sleep(LOOP_S)
     _idle(runner, drain, LEAD_FRAMES / shot.rate_hz)
+    if not camera.limits.host_times:
+        recording.off_s = _switched(runner, None)
+        _idle(runner, drain, MARK_FRAMES / shot.rate_hz)
     _keep(runner, shot, store, exposure, recording, camera.stop())
     return recording
+
+
+def _switched(runner: Runner, light: str | None) -> float:
+    """Switch, and when that was."""
+    before = runner.clock.now()
+    runner.switch(light)
+    return (before + runner.clock.now()) / 2
 
 
 def _idle(runner: Runner, drain: Callable[[], None], duration_s: float) -> None:
@@ -174,7 +195,7 @@ def _assemble(
     track = fit_track(recording.reports, (first + ramp, last - ramp), shot.speed_mm_s, limits.step_mm)
     camera = runner.devices.camera.limits
     slots = row(store.stored, first=camera.sequence_first, last=camera.sequence_last, period_s=1.0 / shot.rate_hz)
-    clock = _camera_clock(recording, options.latency_s)
+    clock = _camera_clock(recording, store, options.latency_s)
     placed = place(np.array([slot.time_s for slot in slots]), clock, track, limits.step_mm)
     tolerance = 1e-6
     kept = np.flatnonzero(
@@ -210,8 +231,12 @@ def _moves(shot: SlabSweep, chosen: list[Slot], facts: dict[str, Any]) -> Taken:
     return moves, facts
 
 
-def _camera_clock(recording: Recording, latency_s: float) -> Line:
+def _camera_clock(recording: Recording, store: FrameStore, latency_s: float) -> Line:
     """Host time of the frames' times."""
+    if recording.off_s > recording.on_s:
+        whole = [s for s in store.stored if s.level is not None and s.device_time_s is not None]
+        times, levels = np.array([s.device_time_s for s in whole]), np.array([s.level for s in whole])
+        return clock_of_marks(times, levels, Switched(on_s=recording.on_s, off_s=recording.off_s))
     if any(frame.device_time_s is not None for frame in recording.frames):
         return fit_clock(recording.frames, recording.readings, latency_s)
     return Line(centre=0.0, value=-latency_s, slope=1.0, value_sd=UNTIMED_SD_S, slope_sd=0.0, rms=UNTIMED_SD_S)
