@@ -7,6 +7,7 @@ thin strips is transported once, and a frame is the difference of two places of 
 from __future__ import annotations
 
 import math
+import re
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -120,6 +121,9 @@ def plan_of(job: CaptureJob, scene: SynthScene | None) -> Plan:
     names = tuple(lights)
     if len(names) < 3:
         raise SettingsError(f"{rig.lights_file}: {len(names)} lights; three basis lights are needed at least")
+    for name in names:
+        if not re.fullmatch(r"[\w.-]*\w[\w.-]*", name):
+            raise SettingsError(f"light {name!r}: it names files; expected letters, digits, - and .")
     if rig.sweeps > len(names):
         raise SettingsError(f"rig.sweeps={rig.sweeps}: must be at most the number of lights, {len(names)}")
     axes: Sequence[Axis] = ("x", "y") if rig.orthogonal else ("x",)

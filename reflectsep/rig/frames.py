@@ -154,7 +154,8 @@ def row(stored: Sequence[Stored], *, first: int, last: int | None, period_s: flo
     """
     timed = [s for s in stored if s.device_time_s is not None or s.host_time_s is not None]
     if not [s for s in timed if s.fault is None]:
-        raise CameraError(f"{len(stored)} frames came, none of them whole and with a time")
+        why = next((f" ({s.fault})" for s in stored if s.fault), "")
+        raise CameraError(f"{len(stored)} frames came, none of them whole and with a time{why}")
     times = [s.device_time_s if s.device_time_s is not None else s.host_time_s for s in timed]
     numbers = _numbers(timed, times, first, last, period_s)
     slots: dict[int, Slot] = {}
