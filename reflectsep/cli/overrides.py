@@ -115,7 +115,9 @@ def checked(job: str, words: Sequence[str], *, sweeping: bool) -> list[str]:
             raise SettingsError(f"{override.input_line}: {override.key_or_group} is given twice")
         seen.add(override.key_or_group)
         _check_override(cls, override, sweeping)
-    return overrides
+    # A backend's settings differ from those of the one in the YAML: they may be new there, and the backend checks them.
+    open_keys = tuple(f"{name}." for name, kind in _keys(cls).items() if kind.base is dict)
+    return [f"++{word}" if word.startswith(open_keys) else word for word in overrides]
 
 
 def _schema(cls: type) -> type:
@@ -203,7 +205,7 @@ def _check_override(cls: type, override: Override, sweeping: bool) -> None:
         for option in _values(override):
             _check_option(key, option)
     elif any(kind.base is dict and key.startswith(f"{name}.") for name, kind in known.items()):
-        return  # a backend's own setting: it knows its names, and its YAML lists them
+        return  # a backend's own setting: it knows its names
     elif key not in known:
         raise SettingsError(f"{key}: no such setting{nearest(key, [*known, *groups(cls)]) or _some(known)}")
     elif known[key].base is bool and not all(str(value).lower() in ("true", "false") for value in _values(override)):

@@ -259,6 +259,8 @@ class GrblStage:
 
     def _check_settings(self) -> None:
         """The controller's own numbers against the configured ones."""
+        if int(self._settings.get(10, 1)) & 1 == 0 or self._settings.get(13, 0) != 0:
+            raise StageError(f"{self._link.port}: must report machine positions in mm: expected an odd $10, and $13=0")
         for name, axis in self._axes.items():
             index = self._index(name)
             low, high = axis.travel_mm

@@ -39,6 +39,10 @@ class Guard:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
+    def stopping(self) -> None:
+        """The session is being stopped already: from now on an interrupt stops the stage at once."""
+        self.count = max(1, self.count)
+
     def _take(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         self.count += 1
         if self.count > 1:

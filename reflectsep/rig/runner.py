@@ -88,11 +88,12 @@ class Runner:
         """
         check_plan(self.plan, self.devices.stage.limits)
         self._check_space()
-        with Guard(self.devices.stage.abort):
+        with Guard(self.devices.stage.abort) as guard:
             try:
                 self._connect()
                 self._take_all()
             except BaseException as error:
+                guard.stopping()
                 self._fail(error)
                 if isinstance(error, ReflectsepError | Interrupted) or not isinstance(error, Exception):
                     raise
@@ -103,6 +104,7 @@ class Runner:
                     ) from error
                 raise
             finally:
+                guard.stopping()
                 self._release()
 
     def warn(self, text: str) -> None:

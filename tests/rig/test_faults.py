@@ -86,6 +86,13 @@ def press_twice(rig, monkeypatch):
     at_sweep(rig, MOVING, lambda: signal.raise_signal(signal.SIGINT))
 
 
+def press_while_stopping(rig, monkeypatch):
+    """The camera dies, and somebody presses Ctrl-C while the stage is being held."""
+    press_twice(rig, monkeypatch)
+    rig.hooks.clear()
+    camera_dies(rig, monkeypatch)
+
+
 def press_while_homing(rig, monkeypatch):
     board = rig.bench.board
     advance = board.advance
@@ -284,6 +291,7 @@ FAULTS = {
     "feed hold by hand": (send(b"!"), "no end of the motion in time", "safe"),
     "Ctrl-C once": (press(signal.SIGINT), "SIGINT", "safe"),
     "Ctrl-C twice": (press_twice, "SIGINT", "safe"),
+    "Ctrl-C while an error is handled": (press_while_stopping, "no longer there", "safe"),
     "Ctrl-C while homing": (press_while_homing, "SIGINT", "safe"),
     "Ctrl-C while a frame is written": (press_while_writing, "SIGINT", "safe"),
     "SIGTERM": (press(signal.SIGTERM), "SIGTERM", "safe"),
@@ -399,6 +407,8 @@ def test_commands_before_the_banner_vanish_and_are_not_relied_on(rig_in):
         ({"end_mm": -69.0}, {}, "its speed cannot be checked"),
         ({}, {110: 1000.0}, "is 16.6667 mm/s, less than max_speed_mm_s=50"),
         ({}, {100: 200.0}, r"\$100=200, but the configuration says steps_per_mm=250"),
+        ({}, {10: 0.0}, r"expected an odd \$10, and \$13=0"),
+        ({}, {13: 1.0}, r"expected an odd \$10, and \$13=0"),
         ({}, {20: 1.0, 130: 150.0}, "soft limits allow -150 to 0 mm"),
     ],
 )

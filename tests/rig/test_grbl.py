@@ -48,7 +48,8 @@ def test_connects_homes_moves_and_reports_the_true_position():
         reports = finish(stage)
         assert len(reports) >= 5
         for report in reports:
-            assert abs(report.position_mm - firmware.true_position(report.time_s)[0]) < 0.015
+            # 10 mm/s, and 10 ms for a busy host to hand a byte over; the precision is measured further down.
+            assert abs(report.position_mm - firmware.true_position(report.time_s)[0]) < 0.1
         assert firmware.true_position(time.monotonic())[0] == pytest.approx(-12.0, abs=1e-6)
         stage.close()
 
