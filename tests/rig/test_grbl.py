@@ -122,7 +122,7 @@ def test_slit_position_of_500_frames_in_real_time():
 
 def check_500_frames(stage, clock, true_position):
     """2 mm/s, 25 frames a second, 5 reports a second, half a second of stall in the middle: 20 um at worst."""
-    shot = SlabSweep(name="s", light="L1", axis="x", start_mm=-45.0, end_mm=-5.0, speed_mm_s=2.0, rate_hz=25.0)
+    shot = SlabSweep(name="s", light="L1", axis="x", start_mm=-45.5, end_mm=-5.0, speed_mm_s=2.0, rate_hz=25.0)
     stage.connect()
     stage.home()
     limits = stage.limits["x"]
