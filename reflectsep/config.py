@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from reflectsep.errors import SettingsError
 from reflectsep.settings import check, required, setting, shown
@@ -28,6 +28,48 @@ class ObjectSettings:
     preset: Literal["wax", "pudding", "plastic", "marble", "skin"] = setting("wax", "simulated object")
     size_px: int = setting(96, "width and height of the simulated pictures", at_least=16, at_most=4096)
     channels: Literal[1, 3] = setting(1, "1 for grey, 3 for colour")
+    full_exposure_s: float | None = setting(
+        None, "of its full pictures when captured; null: the rig's", above=0.0, at_most=3600.0
+    )
+    slab_exposure_s: float | None = setting(
+        None, "of its slab frames when captured; null: the rig's", above=0.0, at_most=3600.0
+    )
+    extent_mm: list[float] | None = setting(None, "where a capture's sweeps start and end; null: the rig's", length=2)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class SweepSettings:
+    """How the stage moves the slit in a capture."""
+
+    key: ClassVar[str] = "rig.sweep."
+    speed_mm_s: float = setting(10.0, "of the slit, constant over a sweep", above=0.0)
+    rate_hz: float = setting(10.0, "frames a second", above=0.0, at_most=1000.0)
+    extent_mm: list[float] | None = setting(
+        None, "where the first and last frame are; null: around a simulated object", length=2
+    )
+    park_mm: float = setting(-1.0, "where the slit is out of the light, for full pictures")
+    motion: Literal["continuous", "stepped"] = setting("continuous", "frames on the way, or at rest one by one")
+    dark_frames: int = setting(16, "dark pictures averaged, for each exposure; 0: none", at_least=0, at_most=256)
+    max_lost: float = setting(0.05, "share of a sweep's frames that may be lost", at_least=0.0, at_most=0.5)
+    latency_s: float = setting(
+        0.0, "from mid-exposure to the earliest arrival, where the camera's clock cannot be read", at_least=0.0
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(kw_only=True)
+class DeviceSettings:
+    """What a capture drives: `_target_` names a backend, the rest are its own settings; null: simulated."""
+
+    key: ClassVar[str] = "rig.devices."
+    stage: dict[str, Any] | None = setting(None, "grbl, marlin or simulated")
+    camera: dict[str, Any] | None = setting(None, "aravis, gphoto2, folder, video, command or simulated")
+    lights: dict[str, Any] | None = setting(None, "serial, command, manual or simulated")
 
     def __post_init__(self) -> None:
         check(self)
@@ -35,7 +77,7 @@ class ObjectSettings:
 
 @dataclass(kw_only=True)
 class RigSettings:
-    """Simulated lights, slab and camera; a fit reads all of this from the capture."""
+    """Lights, slab and camera; `simulate` renders them, `capture` drives them, a fit reads them from the capture."""
 
     key: ClassVar[str] = "rig."
     name: str = setting(HOME_RIG, f"added to the default folder names unless it is {HOME_RIG}")
@@ -58,13 +100,20 @@ class RigSettings:
     read_noise: float = setting(0.0, "standard deviation at black, of full scale", at_least=0.0, at_most=0.5)
     shot_noise: float = setting(0.0, "standard deviation at full scale, of full scale", at_least=0.0, at_most=0.5)
     bits: int | None = setting(None, "quantisation; null: none", at_least=4, at_most=16)
-    gamma: float | None = setting(None, "stored value = value ^ (1 / gamma); null: linear", above=0.0, at_most=10.0)
+    gamma: float | None = setting(
+        None, "of the camera's files, value ^ (1 / gamma); null: linear", above=0.0, at_most=10.0
+    )
     headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
     drift_px: float = setting(0.0, "shift of the camera between a light's full picture and its sweep", at_least=0.0)
     drift_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
     drift_across_px: float = setting(0.0, "shift of the camera between the lights' full pictures", at_least=0.0)
     drift_across_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
     drift_within_px: float = setting(0.0, "shift of the camera from a sweep's first frame to its last", at_least=0.0)
+    auto_exposure: Literal["none", "full", "slab", "both"] = setting("none", "which a capture finds by test pictures")
+    lights_file: str | None = setting(None, "a capture's lights (.lp, .json, .txt); null: as simulated", path=True)
+    mask: Literal["auto", "none"] = setting("auto", "of a capture: where any light makes a difference, or none")
+    sweep: SweepSettings = field(default_factory=SweepSettings)
+    devices: DeviceSettings = field(default_factory=DeviceSettings)
 
     def __post_init__(self) -> None:
         check(self)
@@ -157,6 +206,45 @@ class SimulateJob:
     def __post_init__(self) -> None:
         check(self)
         self.out = self.out or f"captures/{folder_name(self.object, self.rig)}"
+
+
+@dataclass(kw_only=True)
+class CaptureJob:
+    """Take the pictures: drive stage, lights and camera through full, dark and sweep shots."""
+
+    key: ClassVar[str] = ""
+    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="wax"))
+    rig: RigSettings = field(default_factory=RigSettings)
+    out: str = setting("", "capture folder to write; default captures/NAME", path=True)
+    dry_run: bool = setting(False, "print the plan, with time and space, and touch nothing")
+    resume: bool = setting(False, "go on with the session in the folder")
+    zeroed: bool = setting(False, "the carriage of a stage without switches was put at zero for the resumption")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or f"captures/{folder_name(self.object, self.rig)}"
+
+
+@dataclass(kw_only=True)
+class CaptureAndFitJob:
+    """Take the pictures and separate them."""
+
+    key: ClassVar[str] = ""
+    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="wax"))
+    rig: RigSettings = field(default_factory=RigSettings)
+    fit: FitSettings = field(default_factory=FitSettings)
+    scatter: ScatterSettings = field(default_factory=ScatterSettings)
+    out: str = setting("", "capture folder to write; default captures/NAME", path=True)
+    result: str = setting("", "result folder to write; default results/NAME", path=True)
+    resume: bool = setting(False, "go on with the session in the folder")
+    zeroed: bool = setting(False, "the carriage of a stage without switches was put at zero for the resumption")
+    overwrite: bool = setting(False, "replace the result that is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        name = folder_name(self.object, self.rig)
+        self.out = self.out or f"captures/{name}"
+        self.result = self.result or f"results/{name}"
 
 
 @dataclass(kw_only=True)
@@ -296,10 +384,23 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | CheckJob | CalibrateJob | DemoJob
+Job = (
+    SimulateJob
+    | CaptureJob
+    | CaptureAndFitJob
+    | FitJob
+    | RelightJob
+    | CompareJob
+    | InfoJob
+    | CheckJob
+    | CalibrateJob
+    | DemoJob
+)
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
+    "capture": CaptureJob,
+    "capture_and_fit": CaptureAndFitJob,
     "fit": FitJob,
     "relight": RelightJob,
     "compare": CompareJob,

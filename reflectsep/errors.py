@@ -31,3 +31,31 @@ class FitError(ReflectsepError):
 
 class MissingExtraError(ReflectsepError):
     """An optional dependency is needed and not installed."""
+
+
+class RigError(ReflectsepError):
+    """The rig cannot do what was asked, or stopped doing it; the text says what state it is in."""
+
+
+class StageError(RigError):
+    """The stage: no connection, a refused or failed motion, a sweep that was not what was asked for."""
+
+
+class AlarmError(StageError):
+    """The stage's controller locked itself; nothing moves until it has been reset and homed."""
+
+
+class LinkLostError(StageError):
+    """The line to a device broke; the device may still be moving."""
+
+
+class CameraError(RigError):
+    """The camera: absent, died, refused a setting, or gave too few whole frames."""
+
+
+class LightsError(RigError):
+    """The lights could not be switched, or say that they are not what was asked for."""
+
+
+class SessionError(RigError):
+    """The session folder cannot be used, or was made by another plan or rig."""

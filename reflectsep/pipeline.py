@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from reflectsep import bench, simulation
 from reflectsep import calibration as calibration_job
-from reflectsep import simulation
 from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
@@ -26,6 +26,8 @@ from reflectsep.comparison import compare_result
 from reflectsep.config import (
     CalibrateJob,
     CalibrationSettings,
+    CaptureAndFitJob,
+    CaptureJob,
     CheckJob,
     CompareJob,
     DemoJob,
@@ -214,6 +216,32 @@ def previews(separation: Separation) -> dict[str, Tensor]:
 def run_simulate(job: SimulateJob, progress: Progress = silent) -> str:
     """Write a simulated capture."""
     return simulation.write(job, progress)
+
+
+def run_capture(job: CaptureJob, progress: Progress = silent) -> str:
+    """Take the pictures of a session, or go on with it."""
+    return bench.capture(job, progress)
+
+
+def run_capture_and_fit(job: CaptureAndFitJob, progress: Progress = silent) -> str:
+    """Take the pictures of a session and separate them."""
+    refuse_folder(job.result, job.overwrite)
+    taken = bench.capture(
+        CaptureJob(object=job.object, rig=job.rig, out=job.out, resume=job.resume, zeroed=job.zeroed), progress
+    )
+    fitted = run_fit(
+        FitJob(
+            object=job.object,
+            rig=job.rig,
+            fit=job.fit,
+            scatter=job.scatter,
+            capture=job.out,
+            out=job.result,
+            overwrite=job.overwrite,
+        ),
+        progress,
+    )
+    return f"{taken}\n{fitted}"
 
 
 def run_fit(job: FitJob, progress: Progress = silent) -> str:

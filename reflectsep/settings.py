@@ -47,6 +47,7 @@ class Kind:
             words = _either([str(choice) for choice in self.choices])
         else:
             names = {str: "a text", int: "a whole number", float: "a number", bool: "true or false"}
+            names[dict] = "keys with values"
             words = names.get(self.base, self.base.__name__)
             if self.base is list:
                 words = "a list of numbers" if self.item is float else "a list of names"
@@ -108,6 +109,8 @@ def _kind(hint: Any) -> Kind:
     if get_origin(hint) is Literal:
         choices = get_args(hint)
         return Kind(base=type(choices[0]), choices=choices)
+    if get_origin(hint) is dict:
+        return Kind(base=dict)
     if get_origin(hint) is list:
         return Kind(base=list, item=get_args(hint)[0])
     return Kind(base=hint)

@@ -12,6 +12,12 @@ from reflectsep.settings import kinds, shown
 
 EXAMPLES = {
     "simulate": ("object=wax", "object=pudding rig=twelve out=captures/p12", "-m object=wax,pudding"),
+    "capture": (
+        "object=wax rig=simulated out=captures/wax",
+        "object=wax rig=bench dry_run=true",
+        "object=wax rig=bench rig.devices.stage.port=/dev/ttyACM0 resume=true",
+    ),
+    "capture_and_fit": ("object=wax rig=simulated",),
     "fit": (
         "capture=captures/wax out=results/wax",
         "object=wax fit=lin_lee scatter=orthogonal",
@@ -81,9 +87,12 @@ def job_help(job: str) -> str:
     parts = [f"reflectsep {job}: {_summary(cls)}", f"usage: reflectsep {job} {argument}", "settings:\n" + _table(cls)]
     for group in groups(cls):
         options = group_options(group)
+        base = kinds(cls)[group].base
+        inner = [kind.base for kind in kinds(base).values() if dataclasses.is_dataclass(kind.base)]
+        tables = "\n".join(_table(one) for one in (base, *inner))
         width = max(map(len, options))
         listed = "\n".join(f"  {group}={name:{width}}  {text}" for name, text in options.items())
-        parts.append(f"{group}, one of:\n{listed}\n" + _table(kinds(cls)[group].base))
+        parts.append(f"{group}, one of:\n{listed}\n" + tables)
     examples = "\n".join(f"  reflectsep {job} {words}".rstrip() for words in EXAMPLES[job])
     return "\n\n".join([*parts, f"examples:\n{examples}"])
 

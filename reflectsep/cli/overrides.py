@@ -115,7 +115,9 @@ def checked(job: str, words: Sequence[str], *, sweeping: bool) -> list[str]:
             raise SettingsError(f"{override.input_line}: {override.key_or_group} is given twice")
         seen.add(override.key_or_group)
         _check_override(cls, override, sweeping)
-    return overrides
+    # A backend's settings differ from those of the one in the YAML: they may be new there, and the backend checks them.
+    open_keys = tuple(f"{name}." for name, kind in _keys(cls).items() if kind.base is dict)
+    return [f"++{word}" if word.startswith(open_keys) else word for word in overrides]
 
 
 def _schema(cls: type) -> type:
@@ -129,6 +131,7 @@ def _schema(cls: type) -> type:
             fields.append((f.name, inner, dataclasses.field(default_factory=inner)))
             continue
         hint: Any = list[kind.item] if kind.base is list and kind.item else kind.base
+        hint = dict[str, Any] if kind.base is dict else hint
         default = MISSING if f.default is dataclasses.MISSING else f.default
         fields.append((f.name, hint | None if kind.optional else hint, dataclasses.field(default=default)))
     return dataclasses.make_dataclass(cls.__name__, fields)
@@ -201,6 +204,8 @@ def _check_override(cls: type, override: Override, sweeping: bool) -> None:
     if key in groups(cls):
         for option in _values(override):
             _check_option(key, option)
+    elif any(kind.base is dict and key.startswith(f"{name}.") for name, kind in known.items()):
+        return  # a backend's own setting: it knows its names
     elif key not in known:
         raise SettingsError(f"{key}: no such setting{nearest(key, [*known, *groups(cls)]) or _some(known)}")
     elif known[key].base is bool and not all(str(value).lower() in ("true", "false") for value in _values(override)):

@@ -1,0 +1,109 @@
+"""The devices that can be named in a configuration, and how one is built from it.
+
+`_target_` is a name of the lists below, or of an entry point in the group `reflectsep.rig` that the user installed
+(named KIND.NAME, e.g. `camera.mine`): never a path to any object that Python could import.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Literal
+
+from reflectsep.errors import SettingsError
+from reflectsep.rig.clock import Clock
+from reflectsep.rig.devices import Devices
+from reflectsep.settings import nearest
+
+Kind = Literal["stage", "camera", "lights"]
+ENTRY_POINTS = "reflectsep.rig"
+INJECTED = ("clock", "bench", "opener", "ask")
+"""Arguments that come from the session, not from the configuration."""
+
+BACKENDS: dict[Kind, dict[str, str]] = {
+    "stage": {
+        "grbl": "reflectsep.rig.grbl:GrblStage",
+        "marlin": "reflectsep.rig.marlin:MarlinStage",
+        "simulated": "reflectsep.rig.simulated:simulated_stage",
+    },
+    "camera": {
+        "aravis": "reflectsep.rig.camera_aravis:AravisCamera",
+        "command": "reflectsep.rig.camera_command:CommandCamera",
+        "folder": "reflectsep.rig.camera_folder:FolderCamera",
+        "gphoto2": "reflectsep.rig.camera_gphoto2:Gphoto2Camera",
+        "simulated": "reflectsep.rig.simulated:SimulatedCamera",
+        "video": "reflectsep.rig.camera_video:VideoCamera",
+    },
+    "lights": {
+        "command": "reflectsep.rig.lights:CommandLights",
+        "manual": "reflectsep.rig.lights:ManualLights",
+        "serial": "reflectsep.rig.lights:SerialLights",
+        "simulated": "reflectsep.rig.simulated:SimulatedLights",
+    },
+}
+
+
+def build_devices(config: Mapping[Kind, Mapping[str, Any]], *, clock: Clock, bench: Any = None) -> Devices:
+    """The three devices of a rig; nothing is connected.
+
+    Args:
+        config: By kind: `_target_` and the arguments of the backend.
+        clock: Of the session.
+        bench: Of simulated devices.
+
+    Raises:
+        SettingsError: a backend that is not known, or arguments that it does not take.
+    """
+    built = {kind: build(kind, config.get(kind) or {}, clock=clock, bench=bench) for kind in BACKENDS}
+    names = {kind: str((config.get(kind) or {}).get("_target_")) for kind in BACKENDS}
+    return Devices(stage=built["stage"], camera=built["camera"], lights=built["lights"], names=names)
+
+
+def build(kind: Kind, config: Mapping[str, Any], **session: Any) -> Any:
+    """One device.
+
+    Args:
+        kind: Which list to look in.
+        config: `_target_` and the backend's arguments.
+        **session: What the session gives: `clock`, `bench`.
+
+    Raises:
+        SettingsError: as `build_devices`.
+    """
+    where = f"rig.devices.{kind}"
+    given = dict(config)
+    name = given.pop("_target_", None)
+    make = _backend(kind, name, where)
+    parameters = inspect.signature(make).parameters
+    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
+    if open_ended:  # simulated_stage hands on to the driver
+        parameters = {**inspect.signature(_backend(kind, "grbl", where)).parameters, **parameters}
+    known = [key for key in parameters if key not in (*INJECTED, "settings", *(("port",) if open_ended else ()))]
+    for key in given:
+        if key not in known:
+            raise SettingsError(f"{where}.{key}: no such setting of {name}{nearest(key, known)} ({', '.join(known)})")
+    missing = [key for key in known if parameters[key].default is inspect.Parameter.empty and key not in given]
+    if missing:
+        raise SettingsError(f"{where}.{missing[0]}: {name} needs it")
+    if "bench" in parameters and session.get("bench") is None:
+        raise SettingsError(f"{where}: {name} needs a simulated bench")
+    own = {key: value for key, value in session.items() if key in parameters and not (open_ended and key == "clock")}
+    try:
+        return make(**given, **own)
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f"{where}: {name}: {error}") from error
+
+
+def _backend(kind: Kind, name: Any, where: str) -> Any:
+    known = BACKENDS[kind]
+    if isinstance(name, str) and name in known:
+        module, attribute = known[name].split(":")
+        return getattr(import_module(module), attribute)
+    for point in entry_points(group=ENTRY_POINTS):
+        if point.name == f"{kind}.{name}":
+            return point.load()
+    raise SettingsError(
+        f"{where}._target_={name}: no such backend{nearest(str(name), known)} (one of {', '.join(known)})"
+    )
