@@ -204,6 +204,27 @@ class CompareJob:
 
 
 @dataclass(kw_only=True)
+class ViewJob:
+    """Write a page in which a result is relit by hand: one offline HTML file."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to show", path=True)
+    other: str | None = setting(None, "a second result, to compare side by side", path=True)
+    out: str = setting("", "page to write (.html); default RESULT/view.html", path=True)
+    max_megapixels: float = setting(
+        4.0, "finest level in the page; a larger result is halved until it fits", at_least=0.001, at_most=100.0
+    )
+    measured: bool = setting(True, "put the measured pictures in, to look at through the lens")
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or str(Path(self.result) / "view.html")
+        if Path(self.out).suffix.lower() not in (".html", ".htm"):
+            raise SettingsError(f"out={self.out}: must end in .html")
+
+
+@dataclass(kw_only=True)
 class InfoJob:
     """Say what is in a capture or a result."""
 
@@ -230,13 +251,14 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | InfoJob | DemoJob
+Job = SimulateJob | FitJob | RelightJob | CompareJob | ViewJob | InfoJob | DemoJob
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
     "fit": FitJob,
     "relight": RelightJob,
     "compare": CompareJob,
+    "view": ViewJob,
     "info": InfoJob,
     "demo": DemoJob,
 }

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reflectsep import simulation
+from reflectsep import presentation, simulation
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, held_out_pictures, without
 from reflectsep.comparison import compare_result
@@ -27,6 +27,7 @@ from reflectsep.config import (
     RelightJob,
     ScatterSettings,
     SimulateJob,
+    ViewJob,
 )
 from reflectsep.data import Capture, Light, PhotometricStack, Scattering
 from reflectsep.errors import ResultError, SettingsError
@@ -249,6 +250,11 @@ def recorded_settings(separation: Separation, result: str) -> FitSettings:
         return FitSettings(**separation.document["settings"]["fit"])
     except (KeyError, TypeError, SettingsError) as error:
         raise ResultError(f"{result}: separation.json has no usable settings.fit ({error})") from error
+
+
+def run_view(job: ViewJob, progress: Progress = silent) -> str:
+    """Write the relighting page of a result, or of two side by side."""
+    return presentation.view(job, progress)
 
 
 def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001  (all jobs are called alike)
