@@ -232,7 +232,7 @@ def _pack_measured(prefix: str, shown: Shown, level: Level, blocks: list[str]) -
     """Add the measured pictures, tile by tile, at the finest level's resolution."""
     pictures = measured_pictures(shown.separation)
     small = {name: reduced(picture, shown.separation.mask, level.factor) for name, picture in pictures.items()}
-    white = max(max(float(picture.max()) for picture in small.values()), 1e-12)
+    white = max(1e-12, *(float(picture.max()) for picture in small.values()))
     for light, picture in enumerate(small.values()):
         planes = coded(picture, white)
         for at in tiles_of(*level.size):

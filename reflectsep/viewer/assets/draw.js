@@ -17,22 +17,33 @@ function start_drawing() {
   return true;
 }
 
+const programs = new Map();
 function compile() {
-  const vertex = "#version 300 es\nvoid main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
-  program = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, "#version 300 es\n" + element("shader").textContent]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) fail("The shader does not compile here: " + gl.getShaderInfoLog(shader));
-  }
-  gl.linkProgram(program);
+  programs.clear();
+  blank = make_texture(new Uint8Array(1), 1, 1, 1, 1);
+}
+
+// The program for so many channels and lights and one quantity, made when first needed.
+function use_program(channels, lights, show) {
+  const key = `${channels} ${lights} ${show}`;
+  if (!programs.has(key)) programs.set(key, built(`#define CHANNELS ${channels}\n#define LIGHTS ${lights}\n#define SHOW ${show}\n`));
+  [program, places] = programs.get(key);
   gl.useProgram(program);
-  places = new Proxy({}, { get: (known, name) => known[name] ??= gl.getUniformLocation(program, name) });
   gl.uniform1i(places.planes, 0);
   gl.uniform1i(places.measured, 1);
-  blank = make_texture(new Uint8Array(1), 1, 1, 1, 1);
+}
+function built(defines) {
+  const vertex = "void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }";
+  const made = gl.createProgram();
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, defines + element("shader").textContent]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, "#version 300 es\n" + text);
+    gl.compileShader(shader);
+    gl.attachShader(made, shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) fail("The shader does not compile here: " + gl.getShaderInfoLog(shader));
+  }
+  gl.linkProgram(made);
+  return [made, new Proxy({}, { get: (known, name) => known[name] ??= gl.getUniformLocation(made, name) })];
 }
 let blank = null;
 
@@ -118,15 +129,14 @@ function tiles_seen(pane, level, unit, at) {
 
 function set_pane(pane, about) {
   const on = lights_on(pane.result), g = about.globals;
-  gl.uniform1i(places.channels, about.channels);
-  gl.uniform1i(places.lights, on.length);
+  use_program(about.channels, on.length, SHOWN[pane.show][0]);
   gl.uniform3fv(places.alpha, [...on[0].alpha, ...(on[1] || on[0]).alpha]);
   gl.uniform1fv(places.power, [on[0].power, (on[1] || on[0]).power]);
   gl.uniform4f(places.globals, state.ns || g.n_s, g.n_d, g.softness, g.haze);
   gl.uniform1f(places.root_scale, about.scale[0]);
   gl.uniform1f(places.lobe_scale, about.scale[1]);
-  gl.uniform3f(places.faders, state.spec, state.loc, state.scat);
-  gl.uniform1i(places.show, SHOWN[pane.show][0]);
+  // Faders scale light, and light is the n_d-th power of the roots.
+  gl.uniform3f(places.faders, state.spec, state.loc ** (1 / g.n_d), state.scat ** (1 / g.n_d));
   gl.uniform1i(places.measured_light, Math.max(0, measured_index(pane.result)));
   gl.uniform1f(places.measured_white, about.measured ? about.measured.white : 1);
   const flag = about.flag_values[state.flag] || 0, base = 2 ** PAGE.flag_bits;

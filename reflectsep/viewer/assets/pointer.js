@@ -1,6 +1,6 @@
 // Mouse, touch and keys.
 const pointers = new Map();
-let drag = null, last_frame = 0;
+let drag = null, last_frame = 0, before_touch = {};
 
 const on_canvas = event => {
   const box = element("picture").getBoundingClientRect();
@@ -81,6 +81,9 @@ function start_pointer() {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, on_canvas(event));
     drag = pointers.size > 1 ? "pinch" : what_is_dragged(event);
+    // The first finger of a pinch comes down a little early: what it moved goes back.
+    if (drag === "pinch") change(before_touch);
+    else before_touch = { x: state.x, y: state.y, x2: state.x2, y2: state.y2, m: state.m, lx: state.lx, ly: state.ly, cut: state.cut };
     if (drag === "light") light_at(event);
     read_out(event);
     canvas.focus({ preventScroll: true });

@@ -1,16 +1,14 @@
+// CHANNELS, LIGHTS and SHOW are defined before this: one program for each combination that is used.
 precision highp float;
 precision highp sampler2DArray;
 uniform sampler2DArray planes;    // per channel (d, B), per channel (s, low flags), (w, high flags and mask)
 uniform sampler2DArray measured;  // one layer a light, sRGB codes
-uniform int channels;
-uniform int lights;
 uniform vec3 alpha[2];            // of lights of unit intensity
 uniform float power[2];           // their intensities
 uniform vec4 globals;             // n_s, n_d, softness, haze
 uniform float root_scale;
 uniform float lobe_scale;         // of B
-uniform vec3 faders;              // specular, local diffuse, scattering
-uniform int show;
+uniform vec3 faders;              // of the specular, and of the roots of local diffuse and scattering
 uniform int measured_light;
 uniform float measured_white;
 uniform int flag_low, flag_high;
@@ -25,7 +23,8 @@ uniform bool smoothed;
 uniform vec4 lens;                // centre, radius, and 1 inside or -1 outside or 0 for no lens, in window pixels
 out vec4 colour;
 
-const int WHOLE = 0, SPECULAR = 1, LOCAL = 2, SCATTERING = 3, DIFFUSE = 4, MEASURED = 5, STRENGTH = 6, FLAGS = 7;
+// SHOW: 0 whole, 1 specular, 2 local diffuse, 3 scattering, 4 whole diffuse, 5 measured, 6 B, 7 flags
+const int MEASURED = 5, STRENGTH = 6, FLAGS = 7;
 const float HAZE_RATIO = 8.0;
 
 float positive_power(float base, float exponent) {
@@ -42,45 +41,57 @@ float lobe(float u) {
   return positive_power(u, globals.x) + haze;
 }
 
-// Eqs. 20 and 21 at one pixel under both lights, linear
-vec3 reflectance(ivec2 p) {
-  vec4 w = texelFetch(planes, ivec3(p, 2 * channels), 0);
-  if (w.w < flag_base) return vec3(0.0);
+// Eqs. 20 and 21 of one channel under one light
+float value(vec3 d, vec3 s, float shine, vec3 mix_) {
   float n_d = globals.y;
-  // faders scale light, and light is the n_d-th power of the roots
-  float f_d = positive_power(faders.y, 1.0 / n_d), f_s = positive_power(faders.z, 1.0 / n_d);
-  vec3 sum = vec3(0.0);
-  for (int j = 0; j < lights; j++) {
-    float shine = lobe(dot(w.xyz, alpha[j]));
-    for (int c = 0; c < channels; c++) {
-      vec3 d = root_scale * texelFetch(planes, ivec3(p, c), 0).xyz;
-      vec3 s = root_scale * texelFetch(planes, ivec3(p, channels + c), 0).xyz;
-      float value;
-      if (show == SPECULAR) value = shine;
-      else if (show == LOCAL) value = positive_power(dot(d, alpha[j]), n_d);
-      else if (show == SCATTERING) value = positive_power(dot(s, alpha[j]), n_d);
-      else {
-        float edge = globals.z * max((s.x + s.y + s.z) / 3.0, 0.0);
-        if (show == WHOLE) value = faders.x * shine + positive_power(
-          soft_positive(dot(f_d * d + f_s * s, alpha[j]), f_s * edge), n_d);
-        else value = positive_power(soft_positive(dot(d + s, alpha[j]), edge), n_d);
-      }
-      sum[c] += power[j] * value;
-    }
-  }
-  return channels == 1 ? sum.xxx : sum;
+#if SHOW == 1
+  return shine;
+#elif SHOW == 2
+  return positive_power(dot(d, mix_), n_d);
+#elif SHOW == 3
+  return positive_power(dot(s, mix_), n_d);
+#else
+  float edge = globals.z * max((s.x + s.y + s.z) / 3.0, 0.0);
+#if SHOW == 4
+  return positive_power(soft_positive(dot(d + s, mix_), edge), n_d);
+#else
+  float root = soft_positive(dot(faders.y * d + faders.z * s, mix_), faders.z * edge);
+  return faders.x * shine + positive_power(root, n_d);
+#endif
+#endif
+}
+
+// one channel under all lights, linear
+float channel(ivec2 p, int c, vec3 w) {
+  vec3 d = root_scale * texelFetch(planes, ivec3(p, c), 0).xyz;
+  vec3 s = root_scale * texelFetch(planes, ivec3(p, CHANNELS + c), 0).xyz;
+  float sum = power[0] * value(d, s, lobe(dot(w, alpha[0])), alpha[0]);
+#if LIGHTS == 2
+  sum += power[1] * value(d, s, lobe(dot(w, alpha[1])), alpha[1]);
+#endif
+  return sum;
+}
+
+vec3 reflectance(ivec2 p) {
+  vec4 w = texelFetch(planes, ivec3(p, 2 * CHANNELS), 0);
+  if (w.w < flag_base) return vec3(0.0);
+#if CHANNELS == 1
+  return vec3(channel(p, 0, w.xyz));
+#else
+  return vec3(channel(p, 0, w.xyz), channel(p, 1, w.xyz), channel(p, 2, w.xyz));
+#endif
 }
 
 vec3 measured_at(ivec2 p) {
   vec3 code = texelFetch(measured, ivec3(p, measured_light), 0).rgb;
   vec3 linear = mix(code / 12.92, pow((code + 0.055) / 1.055, vec3(2.4)), step(0.04045, code));
-  return measured_white * (channels == 1 ? linear.rrr : linear);
+  return measured_white * (CHANNELS == 1 ? linear.rrr : linear);
 }
 
 vec3 radiance(ivec2 p) {
   p = clamp(p, ivec2(0), held - 1);
-  if (show == MEASURED) return measured_at(p);
-  if (show == STRENGTH) return vec3(B_gain * lobe_scale * texelFetch(planes, ivec3(p, 0), 0).w);
+  if (SHOW == MEASURED) return measured_at(p);
+  if (SHOW == STRENGTH) return vec3(B_gain * lobe_scale * texelFetch(planes, ivec3(p, 0), 0).w);
   return reflectance(p);
 }
 
@@ -95,8 +106,8 @@ vec3 toned(vec3 linear) {
 
 vec3 flags_at(ivec2 p) {
   p = clamp(p, ivec2(0), held - 1);
-  int high = int(texelFetch(planes, ivec3(p, 2 * channels), 0).w);
-  int low = int(texelFetch(planes, ivec3(p, channels), 0).w);
+  int high = int(texelFetch(planes, ivec3(p, 2 * CHANNELS), 0).w);
+  int low = int(texelFetch(planes, ivec3(p, CHANNELS), 0).w);
   bool on = (low & flag_low) != 0 || (high & flag_high) != 0;
   vec3 grey = vec3(dot(toned(gain * reflectance(p)), vec3(0.3333)));
   return on ? mix(vec3(1.0, 0.69, 0.0), grey, 0.3) : 0.7 * grey;
@@ -112,8 +123,8 @@ void main() {
   vec2 at = place.xy + window * place.zw;
   if (any(lessThan(at, vec2(tile.xy))) || any(greaterThanEqual(at, vec2(tile.xy + tile.zw)))) discard;
   at -= vec2(tile.xy);
-  if (show == FLAGS) { colour = vec4(flags_at(ivec2(floor(at))), 1.0); return; }
-  float boost = show == STRENGTH ? 1.0 : gain;
+  if (SHOW == FLAGS) { colour = vec4(flags_at(ivec2(floor(at))), 1.0); return; }
+  float boost = SHOW == STRENGTH ? 1.0 : gain;
   if (!smoothed) { colour = vec4(toned(boost * radiance(ivec2(floor(at)))), 1.0); return; }
   vec2 corner = floor(at - 0.5), f = at - 0.5 - corner;
   ivec2 p = ivec2(corner);

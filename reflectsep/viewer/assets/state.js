@@ -13,7 +13,7 @@ const RANGES = {
 };
 const WHOLE_NUMBERS = ["two", "which", "r1", "r2", "m", "smooth"];
 const WORDS = {
-  tone: ["srgb", "shoulder", "linear"], layout: ["single", "lens", "split", "pair"], mode: ["light", "pan", "lens"],
+  tone: ["srgb", "shoulder", "linear"], layout: ["single", "lens", "split", "pair"], mode: ["light", "pan"],
 };
 const SHOWN = {
   whole: [0, "whole picture"], nospec: [4, "without highlight"], specular: [1, "highlight only (off-specular)"],
