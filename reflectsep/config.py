@@ -149,6 +149,7 @@ class FitJob:
     basis: list[str] | None = setting(None, "names of three basis lights; null: the capture's", length=3)
     heldout: list[str] | None = setting(None, "names of lights to leave out of the fit")
     lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
+    report: bool = setting(True, "write report.html beside the result")
 
     def __post_init__(self) -> None:
         check(self)
@@ -204,6 +205,24 @@ class CompareJob:
 
 
 @dataclass(kw_only=True)
+class ReportJob:
+    """Write the report of a result: one offline HTML file, to read or to print."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to report", path=True)
+    capture: str | None = setting(None, "its capture; null: the folder that the result names", path=True)
+    out: str = setting("", "report to write (.html); default RESULT/report.html", path=True)
+    baseline: bool = setting(True, "fit Lin & Lee's model as well, to stand beside; takes as long as a fit")
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or str(Path(self.result) / "report.html")
+        if Path(self.out).suffix.lower() not in (".html", ".htm"):
+            raise SettingsError(f"out={self.out}: must end in .html")
+
+
+@dataclass(kw_only=True)
 class ViewJob:
     """Write a page in which a result is relit by hand: one offline HTML file."""
 
@@ -251,13 +270,14 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | ViewJob | InfoJob | DemoJob
+Job = SimulateJob | FitJob | RelightJob | CompareJob | ReportJob | ViewJob | InfoJob | DemoJob
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
     "fit": FitJob,
     "relight": RelightJob,
     "compare": CompareJob,
+    "report": ReportJob,
     "view": ViewJob,
     "info": InfoJob,
     "demo": DemoJob,

@@ -17,7 +17,7 @@ from torch import Tensor
 from reflectsep import presentation, simulation
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, held_out_pictures, without
-from reflectsep.comparison import compare_result
+from reflectsep.comparison import beside, compare_result, left_out
 from reflectsep.config import (
     CompareJob,
     DemoJob,
@@ -25,6 +25,7 @@ from reflectsep.config import (
     FitSettings,
     InfoJob,
     RelightJob,
+    ReportJob,
     ScatterSettings,
     SimulateJob,
     ViewJob,
@@ -39,6 +40,7 @@ from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
 from reflectsep.progress import Progress, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
+from reflectsep.report.figures import HeldOut
 from reflectsep.report.tone import tone, white_point
 from reflectsep.scatter.measure import measure_scattering
 from reflectsep.scatter.options import ScatterOptions
@@ -179,7 +181,13 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
         document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}
         separation = dataclasses.replace(separation, document=document)
     separation.save(job.out, overwrite=job.overwrite, previews=previews(separation))
-    return f"{job.out}: {summary(separation)}"
+    said = f"{job.out}: {summary(separation)}"
+    if job.report:
+        out = Path(job.out) / "report.html"
+        rows = held_out_rows(separation, separation, capture)
+        presentation.report(out, separation, capture, result=job.out, heldout=rows, progress=progress)
+        said += f"\n  report    {out}"
+    return said
 
 
 def run_relight(job: RelightJob, progress: Progress = silent) -> str:
@@ -252,6 +260,35 @@ def recorded_settings(separation: Separation, result: str) -> FitSettings:
         raise ResultError(f"{result}: separation.json has no usable settings.fit ({error})") from error
 
 
+def run_report(job: ReportJob, progress: Progress = silent) -> str:
+    """Write the report of a result."""
+    refuse_existing(Path(job.out), job.overwrite)
+    separation = load(job.result)
+    capture, baseline, rows = None, None, []
+    named = job.capture or str(separation.document.get("capture") or "")
+    if job.capture is not None or Path(named, "").is_dir():
+        lights_file = separation.document.get("lights_file")
+        capture = load_capture(named, basis=separation.basis, lights_file=lights_file)
+        if job.baseline:
+            heldout = [str(name) for name in separation.document.get("heldout", [])]
+            settings = recorded_settings(separation, job.result)
+            baseline = fit(capture, settings=settings, heldout=heldout, progress=progress, scattering="none")
+        rows = held_out_rows(separation, baseline or separation, capture)
+    presentation.report(
+        Path(job.out), separation, capture, result=job.result, baseline=baseline, heldout=rows, progress=progress
+    )
+    return f"{job.out}: open it in a browser, or print it"
+
+
+def held_out_rows(separation: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:
+    """Lights with a real picture that the fit never saw."""
+    names = [str(name) for name in separation.document.get("heldout", [])]
+    if separation.light_vectors is None:
+        return []
+    pictures = held_out_pictures(capture, names) if names else None
+    return left_out(separation, baseline, capture, names, pictures) + beside(separation, baseline, capture)
+
+
 def run_view(job: ViewJob, progress: Progress = silent) -> str:
     """Write the relighting page of a result, or of two side by side."""
     return presentation.view(job, progress)
@@ -288,4 +325,6 @@ def run_demo(job: DemoJob, progress: Progress = silent) -> str:
     run_relight(RelightJob(result=result, lights=heldout, out=str(out / "relit"), overwrite=again), progress)
     figure = str(out / "compare.png")
     compared = run_compare(CompareJob(result=result, out=figure, overwrite=again), progress)
-    return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}"
+    run_view(ViewJob(result=result, overwrite=again), progress)
+    pages = f"read {out / 'result' / 'report.html'}; move the light in {out / 'result' / 'view.html'}"
+    return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}\n{pages}"

@@ -1,15 +1,27 @@
-"""The jobs that show a result: the relighting page."""
+"""The jobs that show a result: the report and the relighting page."""
 
 from __future__ import annotations
 
+import dataclasses
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
-from reflectsep.config import ViewJob
-from reflectsep.errors import SettingsError
+from reflectsep.calibrate.exposure import developed_stream, response_of
+from reflectsep.calibrate.stack import calibrate_stack, without
+from reflectsep.config import FitSettings, ScatterSettings, ViewJob
+from reflectsep.data import Capture, PhotometricStack, Vector
+from reflectsep.errors import ReflectsepError, SettingsError
 from reflectsep.io.files import refuse_existing
+from reflectsep.io.frames import open_sweep
+from reflectsep.io.lights import read_lights
 from reflectsep.progress import Progress
+from reflectsep.report.figures import HeldOut
+from reflectsep.report.sweeps import SweepView, view_sweep
 from reflectsep.report.tone import white_point
+from reflectsep.report.writer import Facts, write_report
 from reflectsep.separation import Separation, load
+from reflectsep.settings import shown as spelt
 from reflectsep.viewer.page import Shown, write_page
 
 
@@ -42,3 +54,86 @@ def shown(separation: Separation, name: str) -> Shown:
     """A result as it goes into a page: its white is that of its basis pictures."""
     white = white_point(separation.highlight_free + separation.specular, separation.mask)
     return Shown(name=name, separation=separation, white=white)
+
+
+def report(
+    out: Path,
+    separation: Separation,
+    capture: Capture | None,
+    *,
+    result: str,
+    baseline: Separation | None = None,
+    heldout: Sequence[HeldOut] = (),
+    progress: Progress,
+) -> None:
+    """Write the report of a result; what its capture no longer tells is left out, and the report says why."""
+    stack: PhotometricStack | None = None
+    views: tuple[SweepView, ...] = ()
+    notes: list[str] = []
+    progress("report", 0, 3)
+    if capture is None:
+        notes.append("The capture is not there: its pictures, sweeps and exposures are not in this report.")
+    else:
+        try:
+            kept = without(capture, [str(name) for name in separation.document.get("heldout", [])])
+            stack, _ = calibrate_stack(kept, minimum=len(kept.names))
+            progress("report", 1, 3)
+            views = sweep_views(kept, stack, separation)
+        except ReflectsepError as error:
+            notes.append(f"Of the capture not all could be read again: {error}")
+    progress("report", 2, 3)
+    facts = Facts(
+        name=Path(result).resolve().name,
+        separation=separation,
+        command=command(separation, result),
+        capture=capture,
+        stack=stack,
+        sweeps=views,
+        baseline=baseline,
+        heldout=heldout,
+        directions=directions(capture, [light.light for light in heldout]),
+        notes=tuple(notes),
+    )
+    write_report(out, facts)
+    progress("report", 3, 3)
+
+
+def directions(capture: Capture | None, names: Sequence[str]) -> dict[str, Vector]:
+    """Directions of held-out lights: of the capture itself, or of the list beside it."""
+    if capture is None:
+        return {}
+    lights = dict(capture.lights)
+    listed = capture.folder / "heldout.json"
+    if listed.is_file():
+        lights |= read_lights(listed)
+    return {name: found for name in names if name in lights and (found := lights[name].direction) is not None}
+
+
+def sweep_views(capture: Capture, stack: PhotometricStack, separation: Separation) -> tuple[SweepView, ...]:
+    """Every sweep that the result was made from, as the report shows it."""
+    lit = {(s["light"], s["direction"]): s["lit_frames"] for s in separation.document.get("sweeps", [])}
+    response = response_of(capture)
+    views = []
+    for sweep in capture.sweeps:
+        if (sweep.light, sweep.direction) in lit and sweep.light in stack.names:
+            stream = developed_stream(capture, open_sweep(capture, sweep), response)
+            frames = float(lit[sweep.light, sweep.direction])
+            views.append(view_sweep(stack, stream, n_d=float(separation.n_d), lit_frames=frames))
+    return tuple(views)
+
+
+def command(separation: Separation, result: str) -> str:
+    """The command that makes a result again, with every setting that is not the default."""
+    document = separation.document
+    words = ["reflectsep", "fit", f"capture={document.get('capture', 'FOLDER')}", f"out={result}"]
+    words.append(f"basis={spelt(list(separation.basis))}")
+    if document.get("heldout"):
+        words.append(f"heldout={spelt(list(document['heldout']))}")
+    if document.get("lights_file"):
+        words.append(f"lights_file={document['lights_file']}")
+    for group, default in (("fit", FitSettings()), ("scatter", ScatterSettings())):
+        usual = dataclasses.asdict(default)
+        for name, value in document.get("settings", {}).get(group, {}).items():
+            if name in usual and value != usual[name]:
+                words.append(f"{group}.{name}={spelt(value)}")
+    return shlex.join(words)

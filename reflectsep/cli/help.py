@@ -19,6 +19,7 @@ EXAMPLES = {
     ),
     "relight": ("result=results/wax lights=lights.lp out=relit", "result=results/wax 'direction=[0.3,0.2,0.9]'"),
     "compare": ("result=results/wax out=compare.png",),
+    "report": ("result=results/wax", "result=results/wax baseline=false out=wax.html"),
     "view": ("result=results/wax", "result=results/wax other=results/wax_lin_lee out=both.html"),
     "info": ("captures/wax", "results/wax"),
     "demo": ("", "out=elsewhere"),

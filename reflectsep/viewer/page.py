@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from reflectsep.errors import ResultError
-from reflectsep.flags import Flag, count
+from reflectsep.flags import WORDS, Flag, count
 from reflectsep.io.files import atomic_write
 from reflectsep.progress import Progress, silent
 from reflectsep.separation import Separation
@@ -38,20 +38,6 @@ from reflectsep.viewer.planes import (
 
 SCRIPTS = ("state.js", "data.js", "lights.js", "draw.js", "panel.js", "pointer.js", "main.js")
 """Parts of the page's program, in their order."""
-FLAG_TEXTS: Mapping[str, str] = {
-    "OUTSIDE_MASK": "not on the object",
-    "SATURATED": "clipped in at least one picture",
-    "INVALID_INPUT": "not a number in at least one picture",
-    "HOLE_FILLED": "its scattering was partly filled in where the slab lit it",
-    "NO_SWEEP_COVERAGE": "a sweep never lit it: its scattering is a lower bound",
-    "SWEEP_SATURATED": "clipped in slab frames",
-    "FAINT_LOBE": "no highlight seen here: B comes from the prior",
-    "NOT_CONVERGED": "the solver stopped at its limit",
-    "AMBIGUOUS": "two solutions of nearly equal cost",
-    "ATTACHED_SHADOW": "faces away from a basis light",
-    "SHADOW_OR_OUTLIER": "a picture disagrees here: cast shadow or inter-reflection",
-    "UNDEREXPOSED": "below the noise in every basis picture",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +100,7 @@ def write_page(
             document["measured"] = _pack_measured(f"m{index}", shown, levels[0], blocks)
         described.append(document)
         accuracies.append(accuracy)
-    layout = {"tile": TILE, "apron": APRON, "flag_bits": FLAG_BITS, "flags": FLAG_TEXTS}
+    layout = {"tile": TILE, "apron": APRON, "flag_bits": FLAG_BITS, "flags": WORDS}
     text = page_text({"results": described, **layout}, blocks)
     atomic_write(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     return tuple(accuracies)

@@ -11,9 +11,9 @@ import torch
 
 from reflectsep.config import ViewJob
 from reflectsep.errors import ResultError, SettingsError
-from reflectsep.flags import Flag
+from reflectsep.flags import WORDS, Flag
 from reflectsep.pipeline import run_view
-from reflectsep.viewer.page import FLAG_TEXTS, Shown, safe_json, write_page
+from reflectsep.viewer.page import Shown, safe_json, write_page
 
 
 def shown(separation, name="x"):
@@ -45,7 +45,7 @@ def test_json_without_markup_is_the_same_json():
 
 
 def test_every_flag_has_its_words():
-    assert set(FLAG_TEXTS) == {flag.name for flag in Flag}
+    assert set(WORDS) == {flag.name for flag in Flag}
 
 
 def test_the_stated_error_is_that_of_the_stored_halves(result, tmp_path):
