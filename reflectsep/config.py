@@ -174,7 +174,12 @@ class RelightJob:
     orbit: int | None = setting(None, "number of lights on a circle around the view", at_least=1, at_most=9999)
     elevation_deg: float = setting(45.0, "of the orbit above the picture plane", at_least=0.0, at_most=90.0)
     intensity: float = setting(1.0, "times that of every light", at_least=0.0)
-    out: str = setting("relit", "folder to write NAME.exr into", path=True)
+    format: Literal["exr", "png", "gif", "mp4", "ffv1"] = setting(
+        "exr", "linear pictures, or 8-bit pictures for a screen, or one film of all of them in their order"
+    )
+    fps: float = setting(25.0, "frames a second of a film", above=0.0, at_most=240.0)
+    exposure_ev: float = setting(0.0, "stops brighter, of pictures for a screen and films", at_least=-20, at_most=20)
+    out: str = setting("relit", "folder to write NAME.exr, NAME.png or film.* into", path=True)
     overwrite: bool = setting(False, "replace what is there")
 
     def __post_init__(self) -> None:

@@ -193,7 +193,10 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
 def run_relight(job: RelightJob, progress: Progress = silent) -> str:
     """Write pictures under other lights."""
     refuse_folder(job.out, job.overwrite)
+    presentation.require(job)
     separation = load(job.result)
+    if job.format != "exr":
+        return presentation.screen_pictures(job, separation, mixes(job, separation), progress)
     files = relight_to_folder(separation, mixes(job, separation), job.out, overwrite=job.overwrite, progress=progress)
     return f"{job.out}: {len(files)} picture{'s' if len(files) > 1 else ''}"
 

@@ -1,24 +1,30 @@
-"""The jobs that show a result: the report and the relighting page."""
+"""The jobs that show a result: the report, the relighting page, pictures and films for a screen."""
 
 from __future__ import annotations
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
+import torch
 
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, without
-from reflectsep.config import FitSettings, ScatterSettings, ViewJob
+from reflectsep.config import FitSettings, RelightJob, ScatterSettings, ViewJob
 from reflectsep.data import Capture, PhotometricStack, Vector
 from reflectsep.errors import ReflectsepError, SettingsError
-from reflectsep.io.files import refuse_existing
+from reflectsep.io.files import atomic_folder, refuse_existing
+from reflectsep.io.film import SUFFIX, require_film, write_film
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
+from reflectsep.io.pictures import write_picture
 from reflectsep.progress import Progress
+from reflectsep.relight import LightMix, relit_pictures, write_marker
 from reflectsep.report.figures import HeldOut
 from reflectsep.report.sweeps import SweepView, view_sweep
-from reflectsep.report.tone import white_point
+from reflectsep.report.tone import tone, tone_16, white_point
 from reflectsep.report.writer import Facts, write_report
 from reflectsep.separation import Separation, load
 from reflectsep.settings import shown as spelt
@@ -137,3 +143,43 @@ def command(separation: Separation, result: str) -> str:
             if name in usual and value != usual[name]:
                 words.append(f"{group}.{name}={spelt(value)}")
     return shlex.join(words)
+
+
+def require(job: RelightJob) -> None:
+    """Refuse, before any work is done for it, a film that cannot be written here.
+
+    Raises:
+        MissingExtraError: PyAV is needed and not installed.
+    """
+    if job.format not in ("exr", "png"):
+        require_film(Path(job.out), job.format)
+
+
+def screen_pictures(job: RelightJob, separation: Separation, mixes: Mapping[str, LightMix], progress: Progress) -> str:
+    """Write relit pictures for a screen: a PNG each, or one film; returns a line that says so.
+
+    All share one white, that of the basis pictures, so that lights can be compared and a film does not flicker.
+
+    Raises:
+        LightError: a relit picture that is not finite.
+        ResultError: the folder exists and may not be replaced.
+    """
+    white = white_point(separation.highlight_free + separation.specular, separation.mask) / 2.0**job.exposure_ev
+    curve = tone_16 if job.format == "ffv1" else tone
+
+    def frames() -> Iterator[tuple[str, np.ndarray]]:
+        for done, (name, picture) in enumerate(relit_pictures(separation, mixes), start=1):
+            yield name, curve(picture, white=white)
+            progress("relight", done, len(mixes))
+
+    with atomic_folder(job.out, job.overwrite) as folder:
+        if job.format in ("exr", "png"):
+            for name, pixels in frames():
+                write_picture(folder / f"{name}.png", torch.from_numpy(pixels).permute(2, 0, 1))
+            said = f"{job.out}: {len(mixes)} picture{'s' if len(mixes) > 1 else ''}"
+        else:
+            film = f"film{SUFFIX[job.format]}"
+            count = write_film(folder / film, (pixels for _, pixels in frames()), kind=job.format, fps=job.fps)
+            said = f"{Path(job.out) / film}: {count} frames, {count / job.fps:.1f} s"
+        write_marker(folder, mixes)
+    return f"{said}; white is {white:.4g} in the capture's units"

@@ -17,7 +17,11 @@ EXAMPLES = {
         "object=wax fit=lin_lee scatter=orthogonal",
         "-m object=wax,pudding hydra/launcher=joblib",
     ),
-    "relight": ("result=results/wax lights=lights.lp out=relit", "result=results/wax 'direction=[0.3,0.2,0.9]'"),
+    "relight": (
+        "result=results/wax lights=lights.lp out=relit",
+        "result=results/wax 'direction=[0.3,0.2,0.9]'",
+        "result=results/wax orbit=72 format=mp4 out=orbit",
+    ),
     "compare": ("result=results/wax out=compare.png",),
     "report": ("result=results/wax", "result=results/wax baseline=false out=wax.html"),
     "view": ("result=results/wax", "result=results/wax other=results/wax_lin_lee out=both.html"),
