@@ -228,6 +228,26 @@ class ReportJob:
 
 
 @dataclass(kw_only=True)
+class ExportJob:
+    """Write a result as files that RTI viewers and renderers open."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to export", path=True)
+    format: Literal["relight_ptm", "relight_hsh", "ptm", "textures"] = setting(
+        "relight_hsh", "info.json with planes (Relight, OpenLIME) of PTM or HSH; a .ptm file; textures for a renderer"
+    )
+    tilt_deg: float = setting(
+        60.0, "largest angle off the view of the relit pictures that it is fitted to", at_least=5.0, at_most=80.0
+    )
+    out: str = setting("", "folder to write; default RESULT/FORMAT", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or str(Path(self.result) / self.format)
+
+
+@dataclass(kw_only=True)
 class ViewJob:
     """Write a page in which a result is relit by hand: one offline HTML file."""
 
@@ -275,7 +295,7 @@ class DemoJob:
         check(self)
 
 
-Job = SimulateJob | FitJob | RelightJob | CompareJob | ReportJob | ViewJob | InfoJob | DemoJob
+Job = SimulateJob | FitJob | RelightJob | CompareJob | ReportJob | ViewJob | ExportJob | InfoJob | DemoJob
 
 JOBS: dict[str, type[Job]] = {
     "simulate": SimulateJob,
@@ -284,6 +304,7 @@ JOBS: dict[str, type[Job]] = {
     "compare": CompareJob,
     "report": ReportJob,
     "view": ViewJob,
+    "export": ExportJob,
     "info": InfoJob,
     "demo": DemoJob,
 }

@@ -14,13 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from reflectsep import presentation, simulation
+from reflectsep import exporting, presentation, simulation
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, held_out_pictures, without
 from reflectsep.comparison import beside, compare_result, left_out
 from reflectsep.config import (
     CompareJob,
     DemoJob,
+    ExportJob,
     FitJob,
     FitSettings,
     InfoJob,
@@ -290,6 +291,11 @@ def held_out_rows(separation: Separation, baseline: Separation, capture: Capture
         return []
     pictures = held_out_pictures(capture, names) if names else None
     return left_out(separation, baseline, capture, names, pictures) + beside(separation, baseline, capture)
+
+
+def run_export(job: ExportJob, progress: Progress = silent) -> str:
+    """Write a result as files that other programs open."""
+    return exporting.export(job, progress)
 
 
 def run_view(job: ViewJob, progress: Progress = silent) -> str:

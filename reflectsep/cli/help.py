@@ -25,6 +25,7 @@ EXAMPLES = {
     "compare": ("result=results/wax out=compare.png",),
     "report": ("result=results/wax", "result=results/wax baseline=false out=wax.html"),
     "view": ("result=results/wax", "result=results/wax other=results/wax_lin_lee out=both.html"),
+    "export": ("result=results/wax", "result=results/wax format=textures out=wax_textures"),
     "info": ("captures/wax", "results/wax"),
     "demo": ("", "out=elsewhere"),
 }

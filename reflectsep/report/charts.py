@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -22,6 +24,15 @@ from reflectsep.report.valley import Valley
 SEQUENTIAL, DIVERGING, CYCLE = "cividis", "PuOr", ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Perceptually even maps, and the palette of Okabe and Ito (2008)."""
 PANEL_IN = 2.4
+
+
+class Chart(Figure):
+    """A figure that a notebook shows without pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        data = io.BytesIO()
+        FigureCanvasAgg(self).print_png(data)
+        return data.getvalue()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +50,7 @@ class Panel:
     diverging: bool = False
 
 
-def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = ()) -> Figure:
+def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = ()) -> Chart:
     """Panels in rows, with a heading left of each row where given; scales are pixels of the picture."""
     shape = next(panel.picture.shape[-2:] for row in rows for panel in row if panel.picture is not None)
     columns = max(map(len, rows))
@@ -47,7 +58,7 @@ def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = ()) -> Figure:
     wide = PANEL_IN + 0.35
     # A colour bar takes its room from the picture beside it.
     part = [0.62 if all(panel.unit for panel in row) else 0.82 for row in rows]
-    figure = Figure(figsize=(columns * wide, sum(wide * tall * p + 0.7 for p in part)), layout="constrained")
+    figure = Chart(figsize=(columns * wide, sum(wide * tall * p + 0.7 for p in part)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=part)
     for i, row in enumerate(rows):
         for j in range(columns):
@@ -91,9 +102,9 @@ def _draw(figure: Figure, axes: Axes, panel: Panel) -> None:
     bar.ax.tick_params(labelsize=6.5, which="both")
 
 
-def dome(names: Sequence[str], vectors: Tensor, heldout: Mapping[str, Sequence[float]]) -> Figure:
+def dome(names: Sequence[str], vectors: Tensor, heldout: Mapping[str, Sequence[float]]) -> Chart:
     """Light directions on the hemisphere as the camera sees it; the basis with its triangle, held-out lights open."""
-    figure = Figure(figsize=(4.6, 4.4), layout="constrained")
+    figure = Chart(figsize=(4.6, 4.4), layout="constrained")
     axes = figure.subplots()
     for tilt in (15, 30, 45, 60, 90):
         r = math.sin(math.radians(tilt))
@@ -121,9 +132,9 @@ def _arc(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return path / np.linalg.norm(path, axis=1, keepdims=True)
 
 
-def passage(views: Sequence[SweepView]) -> Figure:
+def passage(views: Sequence[SweepView]) -> Chart:
     """When the slab passes: against position, with the straight line of a constant speed, and as a map."""
-    figure = Figure(figsize=(9.2, 2.6 * len(views)), layout="constrained")
+    figure = Chart(figsize=(9.2, 2.6 * len(views)), layout="constrained")
     axes = figure.subplots(len(views), 2, squeeze=False, width_ratios=(1.7, 1))
     for (line, image), view in zip(axes, views, strict=True):
         row, column = torch.nonzero(view.peak.isfinite(), as_tuple=True)
@@ -142,11 +153,11 @@ def passage(views: Sequence[SweepView]) -> Figure:
     return figure
 
 
-def equation_25(views: Sequence[SweepView], gains: Mapping[tuple[str, str], float], mask: Tensor, n_d: float) -> Figure:
+def equation_25(views: Sequence[SweepView], gains: Mapping[tuple[str, str], float], mask: Tensor, n_d: float) -> Chart:
     """Sum of the frames' roots against the full picture's root, with the line of slope C, one plot a sweep."""
     columns = min(3, len(views))
     rows = math.ceil(len(views) / columns)
-    figure = Figure(figsize=(3.3 * columns, 3.0 * rows), layout="constrained")
+    figure = Chart(figsize=(3.3 * columns, 3.0 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).flatten()
     for axis in axes[len(views) :]:
         axis.axis("off")
@@ -164,9 +175,9 @@ def equation_25(views: Sequence[SweepView], gains: Mapping[tuple[str, str], floa
     return figure
 
 
-def valley(found: Valley) -> Figure:
+def valley(found: Valley) -> Chart:
     """Contours of the misfit over a and B, and its lowest line."""
-    figure = Figure(figsize=(8.6, 3.5), layout="constrained")
+    figure = Chart(figsize=(8.6, 3.5), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     rise = 100 * (found.misfit / found.misfit.min() - 1)
     scales = found.scales.numpy()
@@ -192,11 +203,11 @@ def _steps(levels: Sequence[float]) -> Normalize:
     return BoundaryNorm(levels, 256)
 
 
-def flag_bars(flags: Tensor, mask: Tensor, words: Mapping[str, str]) -> Figure:
+def flag_bars(flags: Tensor, mask: Tensor, words: Mapping[str, str]) -> Chart:
     """Share of the object's pixels that carry each flag."""
     named = [flag for flag in Flag if flag is not Flag.OUTSIDE_MASK]
     share = [100 * float(((flags[mask] & int(flag)) != 0).double().mean()) for flag in named]
-    figure = Figure(figsize=(7.6, 0.28 * len(named) + 0.7), layout="constrained")
+    figure = Chart(figsize=(7.6, 0.28 * len(named) + 0.7), layout="constrained")
     axes = figure.subplots()
     axes.barh([words[str(flag.name)] for flag in named], share, color=CYCLE[0])
     for i, value in enumerate(share):

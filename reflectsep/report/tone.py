@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
 from torch import Tensor
 
+from reflectsep.srgb import encoded
+
 INVALID = (255, 0, 255)
 """Magenta: shown where a value is not a finite number."""
 
@@ -54,9 +56,8 @@ def _coded(picture: Tensor, white: float, largest: int) -> tuple[np.ndarray, np.
         raise ValueError(f"white {white:g}; expected a positive value")
     linear = picture.detach().cpu().double() / white
     valid = torch.isfinite(linear).all(0)
-    linear = torch.nan_to_num(linear, nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, 1.0)
-    curved = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    codes = (largest * curved + 0.5).floor().expand(3, -1, -1).permute(1, 2, 0)
+    linear = torch.nan_to_num(linear, nan=0.0, posinf=0.0, neginf=0.0)
+    codes = (largest * encoded(linear) + 0.5).floor().expand(3, -1, -1).permute(1, 2, 0)
     return codes.numpy().copy(), valid.numpy()
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reflectsep.separation import Separation
+from reflectsep.srgb import encoded
 from reflectsep.viewer.planes import halved_picture
 
 MOST = 24
@@ -31,9 +32,7 @@ def measured_pictures(separation: Separation) -> dict[str, Float[Tensor, "channe
 
 def coded(picture: Float[Tensor, "channels height width"], white: float) -> np.ndarray:
     """8-bit codes (channels, height, width) of the sRGB curve, with `white` at 255."""
-    linear = (picture.double() / white).clamp(0.0, 1.0)
-    curved = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return (255.0 * curved + 0.5).floor().to(torch.uint8).numpy()
+    return (255.0 * encoded(picture.double() / white) + 0.5).floor().to(torch.uint8).numpy()
 
 
 def reduced(picture: Float[Tensor, "channels height width"], mask: Tensor, factor: int) -> Tensor:
