@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +37,10 @@ from reflectsep.errors import ResultError, SettingsError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
 from reflectsep.io.capture import load_capture
-from reflectsep.io.files import refuse_existing, refuse_folder
+from reflectsep.io.files import atomic_write, refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
-from reflectsep.progress import Progress, silent
+from reflectsep.progress import Journal, Progress, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
 from reflectsep.report.figures import HeldOut
 from reflectsep.report.tone import tone, white_point
@@ -172,12 +173,11 @@ def run_simulate(job: SimulateJob, progress: Progress = silent) -> str:
 def run_fit(job: FitJob, progress: Progress = silent) -> str:
     """Separate a capture into a result folder."""
     refuse_folder(job.out, job.overwrite)
+    journal = Journal(progress)
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
-    separation = fit(
-        capture, settings=job.fit, scatter=job.scatter, heldout=tuple(job.heldout or ()), progress=progress
-    )
+    separation = fit(capture, settings=job.fit, scatter=job.scatter, heldout=tuple(job.heldout or ()), progress=journal)
     if job.lights_file is not None:
         document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}
         separation = dataclasses.replace(separation, document=document)
@@ -186,8 +186,10 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
     if job.report:
         out = Path(job.out) / "report.html"
         rows = held_out_rows(separation, separation, capture)
-        presentation.report(out, separation, capture, result=job.out, heldout=rows, progress=progress)
+        presentation.report(out, separation, capture, result=job.out, heldout=rows, progress=journal)
         said += f"\n  report    {out}"
+    log = f"{datetime.now(UTC).isoformat(timespec='seconds')} fit of {job.capture}\n{journal.text()}"
+    atomic_write(Path(job.out) / "log.txt", lambda path: path.write_text(log, encoding="utf-8"))
     return said
 
 

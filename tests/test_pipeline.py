@@ -95,6 +95,9 @@ def test_a_fit_leaves_a_report_unless_told_not_to(result, said):
     assert "<td>L7</td>" in text  # held out, and its figures
     assert "fit.max_iterations=2" in text
     assert "Of the capture not all" not in text
+    log = (result / "log.txt").read_text().splitlines()
+    assert "fit of" in log[0]
+    assert {"pictures", "globals", "joint fit", "report"} <= {line.split(":")[0] for line in log[1:]}
     assert not re.search(r"https?://|<script|<link|@import|url\(", text)
 
 

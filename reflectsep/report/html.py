@@ -71,9 +71,10 @@ def picture(figure: Figure, caption: str, alternative: str = "") -> str:
     figure.set_dpi(DPI)
     FigureCanvasAgg(figure).print_png(data)
     source = base64.b64encode(data.getvalue()).decode("ascii")
+    wide = ' class="wide"' if figure.get_figwidth() > 6 else ""
     alternative = html.escape(alternative or caption, quote=True)
     return (
-        f'<figure><img src="data:image/png;base64,{source}" alt="{alternative}">'
+        f'<figure{wide}><img src="data:image/png;base64,{source}" alt="{alternative}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 

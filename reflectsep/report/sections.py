@@ -225,10 +225,10 @@ def global_parameters(separation: Separation, stack: PhotometricStack | None) ->
         parts.append(
             html.picture(
                 valley(trade),
-                f"Misfit over a and B at {trade.pixels} pixels that show the highlight, d refitted at each. The "
-                "longer the "
-                "dark valley, the less the pictures tell a weak lobe from a strong one: along it the split between "
-                "highlight and diffuse part changes, and the pictures hardly do.",
+                f"Misfit over a and B at {trade.pixels} pixels that show the highlight, d refitted at each; pictures "
+                "weigh alike and there are no priors, unlike in the fit. The longer the dark valley, the less the "
+                "pictures tell a weak lobe from a strong one: along it the split between highlight and diffuse part "
+                "changes, and the pictures hardly do.",
             )
         )
     else:

@@ -19,6 +19,7 @@ from reflectsep.separation import Separation
 
 PIXELS = 120
 STEPS = 10
+ROUNDS = 3
 SPAN = 0.3
 
 
@@ -53,9 +54,16 @@ def cost_valley(separation: Separation, stack: PhotometricStack, *, count: int =
     a = scales[:, None, None, None] * separation.a.double()
     B = separation.B.mean(0)[row, column].double()
     case = _Case(separation=separation, alpha=alpha.double(), d=d, s=s, I=I)
-    held = case.least_misfit(a, scales[None, :, None] * B, free_B=False)
+    x = d.expand(count, count, -1, -1).clone()  # jvp writes into what it is given
+    _, held = case.refitted(x, a, scales[None, :, None] * B)
     # B starts where each pixel's own misfit is least on the grid: from elsewhere it may end in a false minimum.
-    free = case.least_misfit(a, (scales[held.argmin(1)] * B)[:, None], free_B=True)
+    best = scales[held.argmin(1)][:, None, :, None]
+    x, free = case.refitted(torch.cat([d.expand(count, 1, -1, -1), best], -1), a, B.expand(count, 1, -1))
+    # Where a neighbour along the valley found a better one, go on from there.
+    for shift in (1, -1) * ROUNDS:
+        other, misfit = case.refitted(x.roll(shift, 0), a, B.expand(count, 1, -1))
+        x = torch.where((misfit < free)[..., None], other, x)
+        free = torch.minimum(free, misfit)
     return Valley(scales=scales, misfit=held.mean(-1).sqrt(), along=free.mean(-1).sqrt()[:, 0], pixels=len(where))
 
 
@@ -77,11 +85,8 @@ class _Case:
         u = (a + B[..., None] * d) @ self.alpha.mT
         return body + lobe(u, self.separation.n_s.double(), self.separation.haze.double()) - self.I
 
-    def least_misfit(self, a: Tensor, B: Tensor, *, free_B: bool) -> Float[Tensor, "*grid pixels"]:
-        """Mean square misfit at every place of the grid and pixel after refitting d, and B where it is free."""
-        unknowns = 4 if free_B else 3
-        x = self.d.new_ones(len(a), B.shape[1], len(self.d), unknowns)  # B is over its start
-        x[..., :3] = self.d
+    def refitted(self, x: Float[Tensor, "*grid pixels unknowns"], a: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
+        """`x` after Gauss-Newton from there, and the mean square misfit of every pixel and place of the grid."""
 
         def residual(x: Tensor) -> Tensor:
             return self.residual(x, a, B)
@@ -89,7 +94,7 @@ class _Case:
         damping = torch.full_like(x[..., :1], 1e-3)
         r = residual(x)
         for _ in range(STEPS):
-            axes = torch.eye(unknowns, dtype=x.dtype)
+            axes = torch.eye(x.shape[-1], dtype=x.dtype)
             J = torch.stack([torch.func.jvp(residual, (x,), (e.expand_as(x).clone(),))[1] for e in axes], -1)
             normal = J.mT @ J
             scale = normal.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9)
@@ -98,4 +103,4 @@ class _Case:
             better = (trial.square().sum(-1) < r.square().sum(-1))[..., None]
             x, r = torch.where(better, x - step, x), torch.where(better, trial, r)
             damping = torch.where(better, damping / 5, damping * 5).clamp(1e-8, 1e8)
-        return r.square().mean(-1)
+        return x, r.square().mean(-1)
