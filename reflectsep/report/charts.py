@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from reflectsep.flags import Flag
+from reflectsep.report.figures import object_slices
 from reflectsep.report.sweeps import SweepView
 from reflectsep.report.tone import tone
 from reflectsep.report.valley import Valley
@@ -50,9 +51,14 @@ class Panel:
     diverging: bool = False
 
 
-def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = ()) -> Chart:
-    """Panels in rows, with a heading left of each row where given; scales are pixels of the picture."""
+def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = (), mask: Tensor | None = None) -> Chart:
+    """Panels in rows, with a heading left of each row where given; scales are pixels of the whole picture.
+
+    Pictures are cut to the object where its `mask` is given.
+    """
     shape = next(panel.picture.shape[-2:] for row in rows for panel in row if panel.picture is not None)
+    box = (slice(0, shape[0]), slice(0, shape[1])) if mask is None else object_slices(mask)
+    shape = (box[0].stop - box[0].start, box[1].stop - box[1].start)
     columns = max(map(len, rows))
     tall = min(1.5, max(0.4, shape[0] / shape[1]))
     wide = PANEL_IN + 0.35
@@ -64,6 +70,8 @@ def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = ()) -> Chart:
         for j in range(columns):
             if j < len(row) and row[j].picture is not None:
                 _draw(figure, axes[i][j], row[j])
+                axes[i][j].set_xlim(box[1].start - 0.5, box[1].stop - 0.5)
+                axes[i][j].set_ylim(box[0].stop - 0.5, box[0].start - 0.5)
             else:
                 axes[i][j].axis("off")
         if i < len(heads):

@@ -144,7 +144,7 @@ def _frames(views: Sequence[SweepView]) -> str:
         )
         heads.append(f"frame {frame.index}")
     return html.picture(
-        grid(rows, heads),
+        grid(rows, heads, view.peak.isfinite()),
         f"Three frames of the sweep of light {view.light} along {view.direction}: as captured; without the band "
         "that the "
         "slab lights itself (grey); and with the hole filled by the maximum of its surroundings, as in the "
@@ -185,7 +185,7 @@ def components(separation: Separation, baseline: Separation | None) -> Section:
         "share of "
         "the light that comes from the object."
     )
-    parts.append(html.picture(grid(rows, [f"light {name}" for name in separation.basis]), caption))
+    parts.append(html.picture(grid(rows, [f"light {name}" for name in separation.basis], separation.mask), caption))
     if baseline is None:
         advice = "Lin & Lee's components stand beside these in the report that `reflectsep report` writes."
         parts.append(html.text(advice, "dim"))
@@ -276,9 +276,10 @@ def maps(separation: Separation) -> Section:
         for start in range(0, min(len(signed), 24), 4)
     ]
     parts = [
-        html.picture(grid(rows), "Per pixel, over all lights and channels. Grey: not on the object."),
+        html.picture(grid(rows, mask=mask), "Per pixel, over all lights and channels. Grey: not on the object."),
         html.heading("Picture minus model, light by light"),
-        html.picture(grid(light_rows), "Orange and purple are pictures that are darker and brighter than the model."
+        html.picture(grid(light_rows, mask=mask),
+                     "Orange and purple are pictures that are darker and brighter than the model."
                      " What has structure here is not in the model: cast shadows, inter-reflection, drift."),
         html.heading("Flags"),
         html.picture(flag_bars(separation.flags, mask, WORDS), "Pixels of the object that carry each flag."),
@@ -294,7 +295,7 @@ def maps(separation: Separation) -> Section:
         for start in range(0, len(chosen), 4)
     ]  # fmt: skip
     if flag_rows:
-        parts.append(html.picture(grid(flag_rows), "Where they are."))
+        parts.append(html.picture(grid(flag_rows, mask=mask), "Where they are."))
     return Section(key="maps", title="Residual, uncertainty, flags", body="".join(parts))
 
 
@@ -346,7 +347,7 @@ def held_out(separation: Separation, lights: Sequence[HeldOut], baseline: bool) 
         key="heldout",
         title=title,
         body=html.picture(
-            grid(rows, [f"light {light.light}" for light in lights]),
+            grid(rows, [f"light {light.light}" for light in lights], mask),
             f"Real pictures, relit ones and their difference; white is {white:.3g}. dB: peak signal to noise "
             "ratio against "
             "the real picture's peak; %: RMS error of the real picture's RMS.",

@@ -82,7 +82,7 @@ def lead(facts: Facts) -> str:
     parts = [
         html.text(str(document.get("model", "")), "dim"),
         html.picture(
-            grid([row]),
+            grid([row], mask=separation.mask),
             f"The picture under light {separation.basis[0]}, taken apart. All panels share one exposure; values "
             "are linear "
             "in the capture's units, shown through the sRGB curve. Local diffuse light left the object where it "

@@ -13,7 +13,7 @@ import torch
 from reflectsep.data import Light
 from reflectsep.relight import alphas_for
 from reflectsep.report.tone import tone, white_point
-from reflectsep.viewer.page import Shown, write_page
+from reflectsep.viewer.page import Shown, object_box, write_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
@@ -179,7 +179,7 @@ def test_dragging_moves_the_light_on_picture_and_hemisphere(page, colour_page):
     assert page.run("document.getElementById('extrapolated').hidden")
 
 
-def test_touch_moves_the_light_and_two_fingers_zoom(page, colour_page):
+def test_touch_moves_the_light_and_two_fingers_zoom(page, colour, colour_page):
     page.open(colour_page)
     left, top, width, height = page.box("#picture")
     x, y = left + width / 2, top + height / 2
@@ -189,7 +189,9 @@ def test_touch_moves_the_light_and_two_fingers_zoom(page, colour_page):
     page.touch([(x - 50, y), (x - 100, y)], [(x + 50, y), (x + 100, y)])
     after = page.state()
     assert after["x"] == before["x"]
-    assert after["zoom"] == pytest.approx(2 * min(width, height) / SIZE, rel=0.02)
+    left, top, right, bottom = object_box(colour.mask)
+    fit = min(width / (right - left), height / (bottom - top))
+    assert after["zoom"] == pytest.approx(2 * fit, rel=0.02)
     assert (after["cx"], after["cy"]) == pytest.approx((0.5, 0.5), abs=0.02)
 
 

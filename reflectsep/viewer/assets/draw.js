@@ -81,16 +81,21 @@ function panes(width, height) {
 
 // Window pixels a pixel of the first result: what the state says, or what makes it fit.
 function zoom_in(rect) {
-  const { width, height } = PAGE.results[0];
-  return state.zoom || Math.min(rect[2] / width, rect[3] / height);
+  const [left, top, right, bottom] = PAGE.results[0].box;
+  return state.zoom || Math.min(rect[2] / (right - left), rect[3] / (bottom - top));
+}
+// Place of the first result in the middle of a pane, 0 to 1 across and down: what the state says, or the object's.
+function middle_of_view() {
+  const { width, height, box: [left, top, right, bottom] } = PAGE.results[0];
+  return state.zoom ? [state.cx, state.cy] : [(left + right) / 2 / width, (top + bottom) / 2 / height];
 }
 
 // picture = offset + window * step, in pixels of the first result, y downwards
 function geometry(rect, zoom) {
   const { width, height } = PAGE.results[0];
-  const fit = !state.zoom;
-  let x = (fit ? 0.5 : state.cx) * width - (rect[0] + rect[2] / 2) / zoom;
-  let y = (fit ? 0.5 : state.cy) * height + (rect[1] + rect[3] / 2) / zoom;
+  const [cx, cy] = middle_of_view();
+  let x = cx * width - (rect[0] + rect[2] / 2) / zoom;
+  let y = cy * height + (rect[1] + rect[3] / 2) / zoom;
   if (zoom === 1) { x = Math.round(x); y = Math.round(y); }  // pixel on pixel
   return { offset: [x, y], step: [1 / zoom, -1 / zoom] };
 }

@@ -21,17 +21,17 @@ function light_at(event) {
 // Zoom about a place of the window (CSS pixels), which stays where it is.
 function zoom_by(factor, x, y) {
   const canvas = element("picture"), scale = devicePixelRatio, pane = pane_at((x ?? canvas.clientWidth / 2) * scale);
-  const before = zoom_in(pane.rect), fit = !state.zoom, after = Math.min(64, Math.max(0.02, before * factor));
+  const before = zoom_in(pane.rect), [cx, cy] = middle_of_view(), after = Math.min(64, Math.max(0.02, before * factor));
   const dx = (x ?? canvas.clientWidth / 2) * scale - pane.rect[0] - pane.rect[2] / 2;
   const dy = (y ?? canvas.clientHeight / 2) * scale - canvas.height + pane.rect[1] + pane.rect[3] / 2;
   const { width, height } = PAGE.results[0], shift = 1 / before - 1 / after;
-  change({ zoom: after, cx: (fit ? 0.5 : state.cx) + dx * shift / width, cy: (fit ? 0.5 : state.cy) + dy * shift / height });
+  change({ zoom: after, cx: cx + dx * shift / width, cy: cy + dy * shift / height });
 }
 function pan_by(dx, dy) {
-  const canvas = element("picture"), zoom = zoom_in(panes(canvas.width, canvas.height)[0].rect), fit = !state.zoom;
+  const canvas = element("picture"), zoom = zoom_in(panes(canvas.width, canvas.height)[0].rect), [cx, cy] = middle_of_view();
   const { width, height } = PAGE.results[0], k = devicePixelRatio / zoom;
   const bounded = value => Math.min(1.2, Math.max(-0.2, value));
-  change({ zoom, cx: bounded((fit ? 0.5 : state.cx) - dx * k / width), cy: bounded((fit ? 0.5 : state.cy) - dy * k / height) });
+  change({ zoom, cx: bounded(cx - dx * k / width), cy: bounded(cy - dy * k / height) });
 }
 function pane_at(x) {
   const canvas = element("picture"), all = panes(canvas.width, canvas.height);
