@@ -263,6 +263,7 @@ class FitJob:
     basis: list[str] | None = setting(None, "names of three basis lights; null: the capture's", length=3)
     heldout: list[str] | None = setting(None, "names of lights to leave out of the fit")
     lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
+    report: bool = setting(True, "write report.html beside the result")
 
     def __post_init__(self) -> None:
         check(self)
@@ -287,7 +288,12 @@ class RelightJob:
     orbit: int | None = setting(None, "number of lights on a circle around the view", at_least=1, at_most=9999)
     elevation_deg: float = setting(45.0, "of the orbit above the picture plane", at_least=0.0, at_most=90.0)
     intensity: float = setting(1.0, "times that of every light", at_least=0.0)
-    out: str = setting("relit", "folder to write NAME.exr into", path=True)
+    format: Literal["exr", "png", "gif", "mp4", "ffv1"] = setting(
+        "exr", "linear pictures, or 8-bit pictures for a screen, or one film of all of them in their order"
+    )
+    fps: float = setting(25.0, "frames a second of a film", above=0.0, at_most=240.0)
+    exposure_ev: float = setting(0.0, "stops brighter, of pictures for a screen and films", at_least=-20, at_most=20)
+    out: str = setting("relit", "folder to write NAME.exr, NAME.png or film.* into", path=True)
     overwrite: bool = setting(False, "replace what is there")
 
     def __post_init__(self) -> None:
@@ -315,6 +321,65 @@ class CompareJob:
         check(self)
         if Path(self.out).suffix.lower() != ".png":
             raise SettingsError(f"out={self.out}: must end in .png")
+
+
+@dataclass(kw_only=True)
+class ReportJob:
+    """Write the report of a result: one offline HTML file, to read or to print."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to report", path=True)
+    capture: str | None = setting(None, "its capture; null: the folder that the result names", path=True)
+    out: str = setting("", "report to write (.html); default RESULT/report.html", path=True)
+    baseline: bool = setting(True, "fit Lin & Lee's model as well, to stand beside; takes as long as a fit")
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or str(Path(self.result) / "report.html")
+        if Path(self.out).suffix.lower() not in (".html", ".htm"):
+            raise SettingsError(f"out={self.out}: must end in .html")
+
+
+@dataclass(kw_only=True)
+class ExportJob:
+    """Write a result as files that RTI viewers and renderers open."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to export", path=True)
+    format: Literal["relight_ptm", "relight_hsh", "ptm", "textures"] = setting(
+        "relight_hsh", "info.json with planes (Relight, OpenLIME) of PTM or HSH; a .ptm file; textures for a renderer"
+    )
+    tilt_deg: float = setting(
+        60.0, "largest angle off the view of the relit pictures that it is fitted to", at_least=5.0, at_most=80.0
+    )
+    out: str = setting("", "folder to write; default RESULT/FORMAT", path=True)
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or str(Path(self.result) / self.format)
+
+
+@dataclass(kw_only=True)
+class ViewJob:
+    """Write a page in which a result is relit by hand: one offline HTML file."""
+
+    key: ClassVar[str] = ""
+    result: str = required("result folder to show", path=True)
+    other: str | None = setting(None, "a second result, to compare side by side", path=True)
+    out: str = setting("", "page to write (.html); default RESULT/view.html", path=True)
+    max_megapixels: float = setting(
+        4.0, "finest level in the page; a larger result is halved until it fits", at_least=0.001, at_most=100.0
+    )
+    measured: bool = setting(True, "put the measured pictures in, to look at through the lens")
+    overwrite: bool = setting(False, "replace what is there")
+
+    def __post_init__(self) -> None:
+        check(self)
+        self.out = self.out or str(Path(self.result) / "view.html")
+        if Path(self.out).suffix.lower() not in (".html", ".htm"):
+            raise SettingsError(f"out={self.out}: must end in .html")
 
 
 @dataclass(kw_only=True)
@@ -391,6 +456,9 @@ Job = (
     | FitJob
     | RelightJob
     | CompareJob
+    | ReportJob
+    | ViewJob
+    | ExportJob
     | InfoJob
     | CheckJob
     | CalibrateJob
@@ -404,6 +472,9 @@ JOBS: dict[str, type[Job]] = {
     "fit": FitJob,
     "relight": RelightJob,
     "compare": CompareJob,
+    "report": ReportJob,
+    "view": ViewJob,
+    "export": ExportJob,
     "info": InfoJob,
     "check": CheckJob,
     "calibrate": CalibrateJob,

@@ -16,13 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Vector = tuple[float, float, float]
+
+
+def _notebook() -> Any:
+    """Displays stand above everything else: they are looked up only when a person asks to see a value."""
+    return import_module("reflectsep.notebook")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +75,9 @@ class Sweep:
     time_s: tuple[float | None, ...] | None = None
     dark: str | None = None
     sha256: tuple[str | None, ...] | None = None
+
+    def _repr_html_(self) -> str:
+        return _notebook().sweep_html(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +137,13 @@ class Capture:
     def bracketed(self, light: str) -> bool:
         """Whether there are several exposures of `light`."""
         return sum(p.kind == "full" and p.light == light for p in self.images) > 1
+
+    def _repr_html_(self) -> str:
+        return _notebook().capture_html(self)
+
+    def plot(self) -> Any:
+        """The full pictures as a matplotlib figure, for a notebook."""
+        return _notebook().capture_plot(self)
 
 
 @runtime_checkable

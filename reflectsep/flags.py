@@ -1,5 +1,6 @@
 """Quality bits: every pixel that is not simply good can name its reasons."""
 
+from collections.abc import Mapping
 from enum import IntFlag
 
 import numpy as np
@@ -37,6 +38,23 @@ class Flag(IntFlag):
     """Below the noise floor in every basis picture."""
     MOVED_OUT = 1 << 12
     """Outside the frame of at least one picture once the camera's drift is undone; the pixel is not fitted."""
+
+
+WORDS: Mapping[str, str] = {
+    "OUTSIDE_MASK": "not on the object",
+    "SATURATED": "clipped in at least one picture",
+    "INVALID_INPUT": "not a number in at least one picture",
+    "HOLE_FILLED": "its scattering was partly filled in where the slab lit it",
+    "NO_SWEEP_COVERAGE": "a sweep never lit it: its scattering is a lower bound",
+    "SWEEP_SATURATED": "clipped in slab frames",
+    "FAINT_LOBE": "no highlight seen here: B comes from the prior",
+    "NOT_CONVERGED": "the solver stopped at its limit",
+    "AMBIGUOUS": "two solutions of nearly equal cost",
+    "ATTACHED_SHADOW": "faces away from a basis light",
+    "SHADOW_OR_OUTLIER": "a picture disagrees here: cast shadow or inter-reflection",
+    "UNDEREXPOSED": "below the noise in every basis picture",
+}
+"""What each flag means, for people."""
 
 
 def decode(value: int) -> list[str]:

@@ -10,19 +10,20 @@ import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from reflectsep import bench, simulation
+from reflectsep import bench, exporting, presentation, simulation
 from reflectsep import calibration as calibration_job
 from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
 from reflectsep.checking import check_capture, draw, table
-from reflectsep.comparison import compare_result
+from reflectsep.comparison import beside, compare_result, left_out
 from reflectsep.config import (
     CalibrateJob,
     CalibrationSettings,
@@ -31,12 +32,15 @@ from reflectsep.config import (
     CheckJob,
     CompareJob,
     DemoJob,
+    ExportJob,
     FitJob,
     FitSettings,
     InfoJob,
     RelightJob,
+    ReportJob,
     ScatterSettings,
     SimulateJob,
+    ViewJob,
 )
 from reflectsep.data import Capture, Light, PhotometricStack, Scattering
 from reflectsep.errors import ResultError, SettingsError
@@ -44,12 +48,13 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
 from reflectsep.io import calibration as calibration_file
 from reflectsep.io.capture import load_capture
-from reflectsep.io.files import refuse_existing, refuse_folder
+from reflectsep.io.files import atomic_write, refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
 from reflectsep.io.stack import read_full, read_mask
-from reflectsep.progress import Progress, silent
+from reflectsep.progress import Journal, Progress, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
+from reflectsep.report.figures import HeldOut
 from reflectsep.report.sheet import motion_plot
 from reflectsep.report.tone import tone, white_point
 from reflectsep.scatter.measure import measure_scattering
@@ -247,6 +252,7 @@ def run_capture_and_fit(job: CaptureAndFitJob, progress: Progress = silent) -> s
 def run_fit(job: FitJob, progress: Progress = silent) -> str:
     """Separate a capture into a result folder."""
     refuse_folder(job.out, job.overwrite)
+    journal = Journal(progress)
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
@@ -256,19 +262,30 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
         scatter=job.scatter,
         calibration=job.calibration,
         heldout=tuple(job.heldout or ()),
-        progress=progress,
+        progress=journal,
     )
     if job.lights_file is not None:
         document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}
         separation = dataclasses.replace(separation, document=document)
     separation.save(job.out, overwrite=job.overwrite, previews=previews(separation))
-    return f"{job.out}: {summary(separation)}"
+    said = f"{job.out}: {summary(separation)}"
+    if job.report:
+        out = Path(job.out) / "report.html"
+        rows = held_out_rows(separation, separation, capture)
+        presentation.report(out, separation, capture, result=job.out, heldout=rows, progress=journal)
+        said += f"\n  report    {out}"
+    log = f"{datetime.now(UTC).isoformat(timespec='seconds')} fit of {job.capture}\n{journal.text()}"
+    atomic_write(Path(job.out) / "log.txt", lambda path: path.write_text(log, encoding="utf-8"))
+    return said
 
 
 def run_relight(job: RelightJob, progress: Progress = silent) -> str:
     """Write pictures under other lights."""
     refuse_folder(job.out, job.overwrite)
+    presentation.require(job)
     separation = load(job.result)
+    if job.format != "exr":
+        return presentation.screen_pictures(job, separation, mixes(job, separation), progress)
     files = relight_to_folder(separation, mixes(job, separation), job.out, overwrite=job.overwrite, progress=progress)
     return f"{job.out}: {len(files)} picture{'s' if len(files) > 1 else ''}"
 
@@ -342,6 +359,52 @@ def recorded_calibration(separation: Separation) -> CalibrationSettings:
     return CalibrationSettings(registration="none") if given is None else CalibrationSettings(**given)
 
 
+def run_report(job: ReportJob, progress: Progress = silent) -> str:
+    """Write the report of a result."""
+    refuse_existing(Path(job.out), job.overwrite)
+    separation = load(job.result)
+    capture, baseline, rows = None, None, []
+    named = job.capture or str(separation.document.get("capture") or "")
+    if job.capture is not None or Path(named, "").is_dir():
+        lights_file = separation.document.get("lights_file")
+        capture = load_capture(named, basis=separation.basis, lights_file=lights_file)
+        if job.baseline:
+            heldout = [str(name) for name in separation.document.get("heldout", [])]
+            settings = recorded_settings(separation, job.result)
+            baseline = fit(
+                capture,
+                settings=settings,
+                calibration=recorded_calibration(separation),
+                heldout=heldout,
+                progress=progress,
+                scattering="none",
+            )
+        rows = held_out_rows(separation, baseline or separation, capture)
+    presentation.report(
+        Path(job.out), separation, capture, result=job.result, baseline=baseline, heldout=rows, progress=progress
+    )
+    return f"{job.out}: open it in a browser, or print it"
+
+
+def held_out_rows(separation: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:
+    """Lights with a real picture that the fit never saw."""
+    names = [str(name) for name in separation.document.get("heldout", [])]
+    if separation.light_vectors is None:
+        return []
+    pictures = held_out_pictures(capture, names) if names else None
+    return left_out(separation, baseline, capture, names, pictures) + beside(separation, baseline, capture)
+
+
+def run_export(job: ExportJob, progress: Progress = silent) -> str:
+    """Write a result as files that other programs open."""
+    return exporting.export(job, progress)
+
+
+def run_view(job: ViewJob, progress: Progress = silent) -> str:
+    """Write the relighting page of a result, or of two side by side."""
+    return presentation.view(job, progress)
+
+
 def run_info(job: InfoJob, progress: Progress = silent) -> str:  # noqa: ARG001  (all jobs are called alike)
     """Say what is in a capture or a result."""
     path = Path(job.path)
@@ -410,4 +473,6 @@ def run_demo(job: DemoJob, progress: Progress = silent) -> str:
     run_relight(RelightJob(result=result, lights=heldout, out=str(out / "relit"), overwrite=again), progress)
     figure = str(out / "compare.png")
     compared = run_compare(CompareJob(result=result, out=figure, overwrite=again), progress)
-    return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}"
+    run_view(ViewJob(result=result, overwrite=again), progress)
+    pages = f"read {out / 'result' / 'report.html'}; move the light in {out / 'result' / 'view.html'}"
+    return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}\n{pages}"

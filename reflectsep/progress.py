@@ -5,6 +5,7 @@ A stage calls `progress(stage, done, total)` as it goes: `stage` is its name, `d
 
 from __future__ import annotations
 
+import io
 import sys
 import time
 from collections.abc import Iterator
@@ -53,6 +54,25 @@ class Lines:
             elapsed_s = self._ended_s - self._started_s
             print(f"{self._prefix}{self._stage}: {elapsed_s:.1f} s", file=self._stream, flush=True)
             self._ended, self._stage = self._stage, None
+
+
+class Journal:
+    """Hands progress on, and keeps when each stage ended: the lines of a result's log file."""
+
+    def __init__(self, progress: Progress = silent) -> None:
+        self._progress = progress
+        self._lines = io.StringIO()
+        self._stages = Lines(self._lines)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Take note of a step and hand it on."""
+        self._stages(stage, done, total)
+        self._progress(stage, done, total)
+
+    def text(self) -> str:
+        """One line a stage that has ended, `NAME: SECONDS s`, in their order."""
+        self._stages.close()
+        return self._lines.getvalue()
 
 
 @contextmanager

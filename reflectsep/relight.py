@@ -140,9 +140,14 @@ def relight_to_folder(
         for done, (name, picture) in enumerate(relit_pictures(separation, mixes, chunk=chunk), start=1):
             write_channels(folder / f"{name}.exr", _channels(picture))
             progress("relight", done, len(mixes))
-        document = {name: _described(mix) for name, mix in mixes.items()}
-        write_json(folder / MARKER, {"format": "reflectsep-relit/1", "lights": document})
+        write_marker(folder, mixes)
     return tuple(Path(out) / f"{name}.exr" for name in mixes)
+
+
+def write_marker(folder: Path, mixes: Mapping[str, LightMix]) -> None:
+    """Write what every light was: `relit.json`, which makes the folder one of ours."""
+    document = {name: _described(mix) for name, mix in mixes.items()}
+    write_json(folder / MARKER, {"format": "reflectsep-relit/1", "lights": document})
 
 
 def relit_pictures(

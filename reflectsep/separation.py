@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,13 @@ class Separation:
         layers["residual.exr"] = picture_channels(self.names, self.residual, channels)
         layers["parameters.exr"] = self._parameters(channels)
         write_result(out, layers, self._document(), overwrite, previews)
+
+    def _repr_html_(self) -> str:
+        return import_module("reflectsep.notebook").separation_html(self)
+
+    def plot(self) -> Any:
+        """Components of the basis lights as a matplotlib figure, for a notebook."""
+        return import_module("reflectsep.notebook").separation_plot(self)
 
     def _parameters(self, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
         ranks = ("1", "2", "3")

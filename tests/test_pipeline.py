@@ -6,6 +6,7 @@ Starts of the fit are thinned out: what is tested here is that the stages fit to
 import dataclasses
 import functools
 import json
+import re
 import shutil
 
 import numpy as np
@@ -83,6 +84,21 @@ def test_fit_says_what_it_found(result, said):
         path.name for path in result.iterdir()
     }
     assert not list(result.parent.glob(".*"))
+
+
+def test_a_fit_leaves_a_report_unless_told_not_to(result, said):
+    text = (result / "report.html").read_text()
+    assert f"report    {result / 'report.html'}" in said
+    for part in ("capture", "scattering", "components", "globals", "maps", "heldout", "reproduce"):
+        assert f'<section id="{part}">' in text
+    assert "relit" in text
+    assert "<td>L7</td>" in text  # held out, and its figures
+    assert "fit.max_iterations=2" in text
+    assert "Of the capture not all" not in text
+    log = (result / "log.txt").read_text().splitlines()
+    assert "fit of" in log[0]
+    assert {"pictures", "globals", "joint fit", "report"} <= {line.split(":")[0] for line in log[1:]}
+    assert not re.search(r"https?://|<script|<link|@import|url\(", text)
 
 
 def test_document_says_how_it_came_about(result, captured):
@@ -221,7 +237,7 @@ def test_plain_folder_of_pictures_fits(captured, tmp_path):
         shutil.copy(captured / "full" / f"{name}.exr", plain / f"{name}.exr")
         rows.append(f"{name}.exr " + " ".join(f"{x:.6f}" for x in capture.lights[name].direction))
     (plain / "lights.lp").write_text("\n".join(rows) + "\n")
-    said = pipeline.run_fit(FitJob(capture=str(plain), out=str(tmp_path / "result"), fit=QUICK))
+    said = pipeline.run_fit(FitJob(capture=str(plain), out=str(tmp_path / "result"), fit=QUICK, report=False))
     assert "Lin & Lee" in said
     separation = reflectsep.load(tmp_path / "result")
     assert len(separation.names) == 7
@@ -240,7 +256,7 @@ def test_colour(tmp_path):
     out = tmp_path / "colour"
     item = ObjectSettings(name="skin", preset="skin", size_px=20, channels=3)
     pipeline.run_simulate(SimulateJob(object=item, rig=RIG, out=str(out)))
-    pipeline.run_fit(FitJob(capture=str(out), out=str(tmp_path / "result"), fit=QUICK))
+    pipeline.run_fit(FitJob(capture=str(out), out=str(tmp_path / "result"), fit=QUICK, report=False))
     separation = reflectsep.load(tmp_path / "result")
     assert separation.scattering.shape == (3, 3, 20, 20)
     assert separation.relight(torch.eye(3)).shape == (3, 3, 20, 20)
@@ -254,3 +270,5 @@ def test_demo_leaves_a_figure_and_relit_pictures(tmp_path):
     assert f"look at {out / 'compare.png'}" in said
     assert {path.name for path in out.iterdir()} == {"capture", "result", "relit", "compare.png"}
     assert len(list((out / "relit").glob("*.exr"))) == 3
+    assert (out / "result" / "report.html").is_file()
+    assert (out / "result" / "view.html").is_file()

@@ -94,3 +94,15 @@ def test_parallel_runs_share_a_terminal_by_lines():
         show("fit", 1, 1)
     assert "\x1b" not in stream.getvalue()
     assert stream.getvalue().startswith("a: fit: ")
+
+
+def test_a_journal_hands_everything_on_and_keeps_a_line_a_stage():
+    handed = []
+    journal = progress.Journal(lambda *step: handed.append(step))
+    steps = [("a", 0, 2), ("a", 2, 2), ("b", 1, 9), ("c", 0, 1), ("c", 1, 1)]
+    for step in steps:
+        journal(*step)
+    assert handed == steps
+    lines = journal.text().splitlines()
+    assert [line.split(":")[0] for line in lines] == ["a", "b", "c"]
+    assert all(line.endswith(" s") for line in lines)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,21 @@ def open_sweep(capture: Capture, sweep: Sweep) -> FrameStream:
     return VideoFrames(sweep=sweep, path=inside(capture.folder, sweep.video), size=size, channels=channels)
 
 
+class Shown:
+    """A stream of frames that shows itself in a notebook."""
+
+    sweep: Sweep
+
+    def _repr_html_(self) -> str:
+        return self.sweep._repr_html_()
+
+    def plot(self, frames: int = 6) -> Any:
+        """Some frames as a matplotlib figure, with one white for all."""
+        return import_module("reflectsep.notebook").stream_plot(self, frames)
+
+
 @dataclass(frozen=True, kw_only=True)
-class FileFrames:
+class FileFrames(Shown):
     """Frames with a file each."""
 
     sweep: Sweep
@@ -70,7 +84,7 @@ class FileFrames:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoFrames:
+class VideoFrames(Shown):
     """Frames of a video, from `video_start` on; lost ones are not in it, so those after them follow at once."""
 
     sweep: Sweep

@@ -114,7 +114,7 @@ def comparison_figure(
     mask = mask.cpu()
     for row in (*rows, *held_out):
         _check(row, mask)
-    crop = _crop(mask)
+    crop = object_slices(mask)
     white = white_point([*(row.original for row in rows), *(light.real for light in held_out)], mask)
     page = _Page(len(rows) + len(held_out), crop)
     page.head(
@@ -247,7 +247,7 @@ def _check(row: ComparisonRow | HeldOut, mask: Tensor) -> None:
         raise ValueError(f"light {row.light}: pictures of shapes {sorted(shapes)}; expected one shape")
 
 
-def _crop(mask: Tensor) -> tuple[slice, slice]:
+def object_slices(mask: Tensor) -> tuple[slice, slice]:
     """The object's bounding box with a margin of 4 %."""
     edges = []
     for size, seen in zip(mask.shape, (mask.any(1), mask.any(0)), strict=True):

@@ -6,8 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, UInt8, UInt16
 from torch import Tensor
+
+from reflectsep.srgb import encoded
 
 INVALID = (255, 0, 255)
 """Magenta: shown where a value is not a finite number."""
@@ -26,17 +28,37 @@ def tone(picture: Float[Tensor, "channels height width"], *, white: float = 1.0)
     Raises:
         ValueError: not 1 or 3 channels, or a white that is not positive.
     """
+    codes, valid = _coded(picture, white, 255)
+    pixels = codes.astype(np.uint8)
+    pixels[~valid] = INVALID
+    return pixels
+
+
+def tone_16(
+    picture: Float[Tensor, "channels height width"], *, white: float = 1.0
+) -> UInt16[np.ndarray, "height width 3"]:
+    """As `tone`, with 16 bits: 65535 is white.
+
+    Raises:
+        ValueError: not 1 or 3 channels, or a white that is not positive.
+    """
+    codes, valid = _coded(picture, white, 65535)
+    pixels = codes.astype(np.uint16)
+    pixels[~valid] = [257 * value for value in INVALID]
+    return pixels
+
+
+def _coded(picture: Tensor, white: float, largest: int) -> tuple[np.ndarray, np.ndarray]:
+    """Codes (height, width, 3) of the sRGB curve as floats, and which pixels are finite."""
     if picture.ndim != 3 or picture.shape[0] not in (1, 3):
         raise ValueError(f"picture of shape {tuple(picture.shape)}; expected (1 or 3, height, width)")
     if not white > 0:
         raise ValueError(f"white {white:g}; expected a positive value")
     linear = picture.detach().cpu().double() / white
     valid = torch.isfinite(linear).all(0)
-    linear = torch.nan_to_num(linear, nan=0.0, posinf=0.0, neginf=0.0).clamp(0.0, 1.0)
-    curved = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    pixels = (255.0 * curved + 0.5).floor().to(torch.uint8).expand(3, -1, -1).permute(1, 2, 0).numpy().copy()
-    pixels[~valid.numpy()] = INVALID
-    return pixels
+    linear = torch.nan_to_num(linear, nan=0.0, posinf=0.0, neginf=0.0)
+    codes = (largest * encoded(linear) + 0.5).floor().expand(3, -1, -1).permute(1, 2, 0)
+    return codes.numpy().copy(), valid.numpy()
 
 
 def white_point(

@@ -1,0 +1,134 @@
+// CHANNELS, LIGHTS and SHOW are defined before this: one program for each combination that is used.
+precision highp float;
+precision highp sampler2DArray;
+uniform sampler2DArray planes;    // per channel (d, B), per channel (s, low flags), (w, high flags and mask)
+uniform sampler2DArray measured;  // one layer a light, sRGB codes
+uniform vec3 alpha[2];            // of lights of unit intensity
+uniform float power[2];           // their intensities
+uniform vec4 globals;             // n_s, n_d, softness, haze
+uniform float root_scale;
+uniform float lobe_scale;         // of B
+uniform vec3 faders;              // of the specular, and of the roots of local diffuse and scattering
+uniform int measured_light;
+uniform float measured_white;
+uniform int flag_low, flag_high;
+uniform float flag_base;          // 2 to the number of bits a half
+uniform float gain;               // exposure over white
+uniform int curve;
+uniform float B_gain;
+uniform vec4 place;               // picture = place.xy + window * place.zw, in pixels of this level
+uniform ivec4 tile;               // first pixel and size without apron, in pixels of this level
+uniform ivec2 held;               // pixels of the tile, apron included
+uniform bool smoothed;
+uniform vec4 lens;                // centre, radius, and 1 inside or -1 outside or 0 for no lens, in window pixels
+out vec4 colour;
+
+// SHOW: 0 whole, 1 specular, 2 local diffuse, 3 scattering, 4 whole diffuse, 5 measured, 6 B, 7 flags
+const int MEASURED = 5, STRENGTH = 6, FLAGS = 7;
+const float HAZE_RATIO = 8.0;
+
+float positive_power(float base, float exponent) {
+  if (!(base > 0.0)) return 0.0;
+  return exponent == 1.0 ? base : pow(base, exponent);
+}
+
+// (x + sqrt(x^2 + e^2)) / 2: max(x, 0) with an edge of width e
+float soft_positive(float x, float e) { return 0.5 * (x + sqrt(x * x + e * e)); }
+
+// off-specular value of u = A (a + B d), Eq. 17
+float lobe(float u) {
+  float haze = globals.w > 0.0 ? globals.w * positive_power(u, globals.x / HAZE_RATIO) : 0.0;
+  return positive_power(u, globals.x) + haze;
+}
+
+// Eqs. 20 and 21 of one channel under one light
+float value(vec3 d, vec3 s, float shine, vec3 mix_) {
+  float n_d = globals.y;
+#if SHOW == 1
+  return shine;
+#elif SHOW == 2
+  return positive_power(dot(d, mix_), n_d);
+#elif SHOW == 3
+  return positive_power(dot(s, mix_), n_d);
+#else
+  float edge = globals.z * max((s.x + s.y + s.z) / 3.0, 0.0);
+#if SHOW == 4
+  return positive_power(soft_positive(dot(d + s, mix_), edge), n_d);
+#else
+  float root = soft_positive(dot(faders.y * d + faders.z * s, mix_), faders.z * edge);
+  return faders.x * shine + positive_power(root, n_d);
+#endif
+#endif
+}
+
+// one channel under all lights, linear
+float channel(ivec2 p, int c, vec3 w) {
+  vec3 d = root_scale * texelFetch(planes, ivec3(p, c), 0).xyz;
+  vec3 s = root_scale * texelFetch(planes, ivec3(p, CHANNELS + c), 0).xyz;
+  float sum = power[0] * value(d, s, lobe(dot(w, alpha[0])), alpha[0]);
+#if LIGHTS == 2
+  sum += power[1] * value(d, s, lobe(dot(w, alpha[1])), alpha[1]);
+#endif
+  return sum;
+}
+
+vec3 reflectance(ivec2 p) {
+  vec4 w = texelFetch(planes, ivec3(p, 2 * CHANNELS), 0);
+  if (w.w < flag_base) return vec3(0.0);
+#if CHANNELS == 1
+  return vec3(channel(p, 0, w.xyz));
+#else
+  return vec3(channel(p, 0, w.xyz), channel(p, 1, w.xyz), channel(p, 2, w.xyz));
+#endif
+}
+
+vec3 measured_at(ivec2 p) {
+  vec3 code = texelFetch(measured, ivec3(p, measured_light), 0).rgb;
+  vec3 linear = mix(code / 12.92, pow((code + 0.055) / 1.055, vec3(2.4)), step(0.04045, code));
+  return measured_white * (CHANNELS == 1 ? linear.rrr : linear);
+}
+
+vec3 radiance(ivec2 p) {
+  p = clamp(p, ivec2(0), held - 1);
+  if (SHOW == MEASURED) return measured_at(p);
+  if (SHOW == STRENGTH) return vec3(B_gain * lobe_scale * texelFetch(planes, ivec3(p, 0), 0).w);
+  return reflectance(p);
+}
+
+vec3 toned(vec3 linear) {
+  if (any(isnan(linear))) return vec3(1.0, 0.0, 1.0);
+  linear = max(linear, vec3(0.0));
+  if (curve == 1) linear = linear * (1.0 + linear / 16.0) / (1.0 + linear);
+  linear = min(linear, vec3(1.0));
+  if (curve == 2) return linear;
+  return mix(12.92 * linear, 1.055 * pow(linear, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, linear));
+}
+
+vec3 flags_at(ivec2 p) {
+  p = clamp(p, ivec2(0), held - 1);
+  int high = int(texelFetch(planes, ivec3(p, 2 * CHANNELS), 0).w);
+  int low = int(texelFetch(planes, ivec3(p, CHANNELS), 0).w);
+  bool on = (low & flag_low) != 0 || (high & flag_high) != 0;
+  vec3 grey = vec3(dot(toned(gain * reflectance(p)), vec3(0.3333)));
+  return on ? mix(vec3(1.0, 0.69, 0.0), grey, 0.3) : 0.7 * grey;
+}
+
+void main() {
+  vec2 window = gl_FragCoord.xy;
+  if (lens.w != 0.0) {
+    float far = distance(window, lens.xy) - lens.z;
+    if (far > 0.0) discard;
+    if (far > -2.0) { colour = vec4(1.0, 0.69, 0.0, 1.0); return; }
+  }
+  vec2 at = place.xy + window * place.zw;
+  if (any(lessThan(at, vec2(tile.xy))) || any(greaterThanEqual(at, vec2(tile.xy + tile.zw)))) discard;
+  at -= vec2(tile.xy);
+  if (SHOW == FLAGS) { colour = vec4(flags_at(ivec2(floor(at))), 1.0); return; }
+  float boost = SHOW == STRENGTH ? 1.0 : gain;
+  if (!smoothed) { colour = vec4(toned(boost * radiance(ivec2(floor(at)))), 1.0); return; }
+  vec2 corner = floor(at - 0.5), f = at - 0.5 - corner;
+  ivec2 p = ivec2(corner);
+  vec3 top = mix(radiance(p), radiance(p + ivec2(1, 0)), f.x);
+  vec3 bottom = mix(radiance(p + ivec2(0, 1)), radiance(p + ivec2(1, 1)), f.x);
+  colour = vec4(toned(boost * mix(top, bottom, f.y)), 1.0);
+}

@@ -1,0 +1,161 @@
+"""The report: what it says of a result, that it is one safe file, and the numbers behind its figures."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import pytest
+import torch
+
+from reflectsep.data import Frame, PhotometricStack, Sweep
+from reflectsep.errors import SweepError
+from reflectsep.flags import Flag
+from reflectsep.presentation import command
+from reflectsep.report.advice import ADVICE, GENERAL, what_to_do
+from reflectsep.report.figures import HeldOut
+from reflectsep.report.sweeps import view_sweep
+from reflectsep.report.valley import cost_valley
+from reflectsep.report.writer import Facts, write_report
+
+SIZE = 24
+
+
+class Slab:
+    """A slab four pixels wide in steps of two over a flat object that does not scatter."""
+
+    def __init__(self, lost=()):
+        self.sweep = Sweep(light="A", count=16, frames="{}.exr", lost=frozenset(lost))
+
+    def __len__(self):
+        return 16
+
+    def __iter__(self):
+        column = torch.arange(SIZE)
+        for index in range(16):
+            if index in self.sweep.lost:
+                continue
+            edge = 2 * index - 4
+            lit = ((column >= edge) & (column < edge + 4)).float()
+            yield Frame(index=index, values=(0.5 * lit).expand(1, SIZE, SIZE).clone())
+
+
+@pytest.fixture
+def flat():
+    mask = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    mask[:2] = False
+    return PhotometricStack(
+        names=("A", "B", "C"),
+        images=torch.full((3, 1, SIZE, SIZE), 0.5) * mask,
+        saturated=torch.zeros(3, 1, SIZE, SIZE, dtype=torch.bool),
+        mask=mask,
+        alpha=torch.eye(3),
+        view=torch.tensor([0.0, 0.0, 1.0]),
+        flags=torch.zeros(SIZE, SIZE, dtype=torch.int32),
+    )
+
+
+def test_a_sweep_is_seen_to_pass_at_its_speed_and_to_add_up(flat):
+    view = view_sweep(flat, Slab(), n_d=1.0, lit_frames=2.0)
+    inside = flat.mask
+    # Pixel x is lit while 2 i - 4 <= x < 2 i: in frames floor(x / 2) + 1 and + 2.
+    expected = (torch.arange(SIZE) // 2 + 1.5).expand(SIZE, SIZE)
+    assert torch.allclose(view.peak[inside], expected[inside])
+    assert view.peak[~inside].isnan().all()
+    assert float(view.straight[1]) == pytest.approx(0.5, abs=0.05)
+    assert torch.allclose(view.root_sum[0][inside], 2 * view.root_full[0][inside])
+    for frame in view.frames:
+        lit = frame.values[0] > 0
+        assert bool((frame.band | ~lit)[inside].all())
+        assert float(frame.filled[0][inside].max()) == 0.0
+
+
+def test_roots_are_summed_with_the_exponent_of_the_result(flat):
+    view = view_sweep(flat, Slab(), n_d=2.0, lit_frames=2.0)
+    assert torch.allclose(view.root_sum[0][flat.mask], torch.tensor(2 * 0.5**0.5))
+    assert torch.allclose(view.root_full[0][flat.mask], torch.tensor(0.5**0.5))
+
+
+def test_a_sweep_without_frames_is_refused(flat):
+    with pytest.raises(SweepError, match="no frame to show"):
+        view_sweep(flat, Slab(lost=range(16)), n_d=1.0, lit_frames=2.0)
+
+
+def test_the_valley_is_lowest_where_the_data_were_made(exact):
+    found = cost_valley(*exact)
+    middle = len(found.scales) // 2
+    assert float(found.scales[middle]) == pytest.approx(1.0)
+    assert divmod(int(found.misfit.argmin()), len(found.scales)) == (middle, middle)
+    assert float(found.misfit[middle, middle]) < 1e-6
+    assert int(found.along.argmin()) == middle
+    # With B free the misfit is nowhere above that of the best common B.
+    assert bool((found.along <= found.misfit.amin(1) + 1e-9).all())
+
+
+def test_there_is_no_valley_without_a_highlight(exact):
+    separation, stack = exact
+    faint = dataclasses.replace(separation, flags=torch.full_like(separation.flags, int(Flag.FAINT_LOBE)))
+    assert cost_valley(faint, stack) is None
+
+
+def test_a_report_without_capture_says_what_is_missing(exact, tmp_path):
+    separation, _ = exact
+    notes = ("The capture is not there.",)
+    write_report(tmp_path / "r.html", Facts(name="x", separation=separation, command="reflectsep fit", notes=notes))
+    text = (tmp_path / "r.html").read_text()
+    assert notes[0] in text
+    assert "No picture was held out" in text
+    assert text.count("data:image/png;base64,") >= 5
+    assert "NaN" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_names_and_warnings_are_no_markup(exact, tmp_path):
+    separation, stack = exact
+    evil = '<script>alert(1)</script>"><img src=x>'
+    document = {**separation.document, "object": evil, "model": evil, "warnings": [evil], "capture": evil}
+    named = dataclasses.replace(separation, names=(evil, *separation.names[1:]), document=document)
+    facts = Facts(name=evil, separation=named, stack=stack, command=f"reflectsep fit {evil}", notes=(evil,))
+    write_report(tmp_path / "r.html", facts)
+    text = (tmp_path / "r.html").read_text()
+    assert "<script" not in text
+    assert "<img src=x" not in text
+    assert "&lt;script&gt;alert(1)" in text
+    assert GENERAL in text
+
+
+def test_held_out_lights_come_with_their_numbers(exact, tmp_path):
+    separation, _ = exact
+    real = separation.relight(torch.tensor([0.4, 0.3, 0.4]))
+    off = real + 0.01 * float(real[:, separation.mask].max())
+    light = HeldOut(light="H1", real=real, ours=off, baseline=0.5 * real)
+    facts = Facts(name="x", separation=separation, command="", heldout=[light], baseline=separation)
+    write_report(tmp_path / "r.html", facts)
+    text = (tmp_path / "r.html").read_text()
+    assert "<td>40.0 dB</td>" in text  # 1 % of the peak
+    assert "<td>50.0 %</td>" in text
+
+
+@pytest.mark.parametrize("words", [words for words, _ in ADVICE])
+def test_every_known_warning_has_its_own_advice(words):
+    assert what_to_do(f"sweep of L1: {words} and more") == dict(ADVICE)[words]
+
+
+def test_the_command_names_what_is_not_the_default(exact):
+    separation, _ = exact
+    document = {
+        "capture": "/data/my wax",
+        "heldout": ["L7"],
+        "settings": {"fit": {"lobe": "haze", "chunk": 32768, "n_s": None}, "scatter": {"distance_px": 2.0}},
+    }
+    said = command(dataclasses.replace(separation, document=document), "out")
+    assert said == (
+        "reflectsep fit 'capture=/data/my wax' out=out 'basis=[L1,L2,L3]' 'heldout=[L7]' "
+        "fit.lobe=haze scatter.distance_px=2.0"
+    )
+
+
+def test_an_object_without_pixels_is_refused(exact, tmp_path):
+    separation, _ = exact
+    empty = dataclasses.replace(separation, mask=torch.zeros_like(separation.mask))
+    with pytest.raises(ValueError, match="no pixel on the object"):
+        write_report(tmp_path / "r.html", Facts(name="x", separation=empty, command=""))
