@@ -53,6 +53,7 @@ WORDS: Mapping[str, str] = {
     "ATTACHED_SHADOW": "faces away from a basis light",
     "SHADOW_OR_OUTLIER": "a picture disagrees here: cast shadow or inter-reflection",
     "UNDEREXPOSED": "below the noise in every basis picture",
+    "MOVED_OUT": "out of the frame of a picture once the camera's drift is undone",
 }
 """What each flag means, for people."""
 
