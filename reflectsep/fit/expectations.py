@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.fit.neighbours import MAD_TO_SD, smooth
-from reflectsep.fit.problem import LOG_C_2, Observations, Priors, log_shape, no_priors, unpack
+from reflectsep.fit.problem import LOG_C_2, Observations, Priors, build_problem, log_shape, no_priors, unpack
+from reflectsep.solve.joint import inverse
+from reflectsep.solve.local import normal_equations
 
 SHAPE_SD = 0.1
 """Scatter of log B about its geometric value before anything is known of it; 0.2 where the lights are unknown."""
@@ -36,16 +38,31 @@ def near_maximum(values: Float[Tensor, "pixels"]) -> float:
 def noise_level(
     images: Float[Tensor, "pixels channels lights"],
     residual: Float[Tensor, "pixels channels lights"],
-    unknowns: int,
+    unknowns: float,
 ) -> float:
     """Standard deviation of a picture's value, from what a fit of `unknowns` a pixel and channel leaves.
 
     The median over pixels, so that highlights and shadows have no say; never below 0.03 % of the peak.
     """
     lights = images.shape[-1]
-    freedom = max(lights - unknowns, 1) / lights
+    freedom = max(lights - unknowns, 0.5) / lights
     rms = residual.square().mean((1, 2)).sqrt()
     return max(float(rms.median()) / freedom**0.5, 3e-4 * near_maximum(images.amax((1, 2))))
+
+
+def unknowns_in_effect(obs: Observations, priors: Priors, local: Tensor, shared: Tensor) -> float:
+    """How many numbers a pixel and channel the pictures determine: the trace of the hat matrix over their rows.
+
+    Priors hold part of a pixel's unknowns, so that counting these would make the noise too large, or, where there are
+    more unknowns than pictures, endless.
+    """
+    index = torch.arange(0, len(obs), max(1, len(obs) // 2000))
+    problem = build_problem(obs.take(index), priors.take(index), robust=None)
+    r, J = problem.linearise_local(local[index], shared)
+    V, _ = normal_equations(r, J, torch.ones_like(r))
+    picture = J[:, : obs.images[0].numel()]
+    trace = torch.einsum("nmp,npq,nmq->n", picture, inverse(V), picture)
+    return float(trace.median()) / obs.channels
 
 
 def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float) -> Priors:

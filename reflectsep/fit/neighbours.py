@@ -1,7 +1,8 @@
 """What the pixels around a pixel say: smooth maps with their scatter, and lobes handed on from neighbour to neighbour.
 
 About one pixel in a hundred has two minima of nearly equal cost, one wrong. Smoothing would blur the ninety-nine;
-instead a pixel is offered its neighbours' lobe as a start, and keeps whichever of its minima costs least.
+instead a pixel is offered its neighbours' lobe as a start, and keeps whichever of its minima costs least. What the
+neighbours would have a pixel be is a regression over them that leaves the pixel itself out.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn.functional import pad, unfold
+from torch.nn.functional import conv2d, pad, unfold
 
 MAD_TO_SD = 1.4826
+QUADRATIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+"""Powers of x and y of a quadratic surface."""
 
 
 def to_map(values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"]) -> Tensor:
@@ -54,3 +57,37 @@ def local_median(
     """Median of the neighbours, channel by channel; a pixel without neighbours keeps its own value."""
     median = neighbourhood(values, mask, radius).nanmedian(-1).values
     return torch.where(median.isfinite(), median, values)
+
+
+def local_quadratic(
+    values: Float[Tensor, "pixels channels"],
+    weight: Float[Tensor, "pixels"],
+    mask: Bool[Tensor, "height width"],
+    sigma_px: float,
+) -> tuple[Float[Tensor, "pixels channels"], Float[Tensor, "pixels"]]:
+    """Every pixel as its neighbours predict it, and the variance of that if `weight` is 1 / variance.
+
+    A quadratic surface through the others, by least squares under a Gaussian window: a mean would flatten whatever is
+    curved, and a curved surface is what a highlight lies on.
+    """
+    reach = max(1, round(3 * sigma_px))
+    along = torch.arange(-reach, reach + 1, dtype=values.dtype) / sigma_px
+    window = torch.exp(-0.5 * along.square())
+    weights, weighted = to_map(weight[:, None], mask), to_map(values * weight[:, None], mask)
+
+    def moment(picture: Tensor, px: int, py: int) -> Float[Tensor, "pixels channels"]:
+        kernel = (along**py * window)[:, None] * (along**px * window)
+        if px == py == 0:
+            kernel[reach, reach] = 0.0
+        return conv2d(picture[:, None], kernel[None, None], padding=reach)[:, 0][:, mask].T
+
+    powers = {(a + c, b + d) for a, b in QUADRATIC for c, d in QUADRATIC}
+    moments = {power: moment(weights, *power)[:, 0] for power in sorted(powers)}
+    system = torch.stack([torch.stack([moments[a + c, b + d] for c, d in QUADRATIC], -1) for a, b in QUADRATIC], -2)
+    right = torch.stack([moment(weighted, a, b) for a, b in QUADRATIC], 1)
+    unit = system.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
+    # A trace of a ridge: where few neighbours are left the surface is flatter rather than wild.
+    ridge = 1e-4 * torch.eye(len(QUADRATIC), dtype=values.dtype)
+    inverse = torch.linalg.inv(system * unit[:, :, None] * unit[:, None, :] + ridge)
+    surface = (inverse @ (right * unit[:, :, None])) * unit[:, :, None]
+    return surface[:, 0], inverse[:, 0, 0] * unit[:, 0].square()

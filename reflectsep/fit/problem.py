@@ -8,6 +8,7 @@ Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel
     shape     (log B + log(|M d|^2 / M d . V) - log C_2) / tau       B d is C_2 (N.V) N.L_k, so B follows from d
     parallel  (d + s) off the direction of s, relative to |s|         whole and scattered light see one irradiance
     ratio     (d + s) / s against its neighbourhood                   how much scatters changes slowly over a surface
+    lobe      B d / C_2 against its neighbourhood                     the surface's shape is smooth, whatever its albedo
     measured  (s - measured s) / its standard deviation               where s is unknown too
 """
 
@@ -87,6 +88,10 @@ class Priors:
     parallel: Float[Tensor, "pixels"]
     ratio: Float[Tensor, "pixels"]
     ratio_weight: Float[Tensor, "pixels"]
+    lobe: Float[Tensor, "pixels 3"]
+    """B d / C_2 = (N.V)(N.L_k) as the neighbours have it."""
+    lobe_weight: Float[Tensor, "pixels"]
+    """1 / standard deviation of that."""
     s_weight: Float[Tensor, "pixels"]
     """1 / standard deviation of the measured s; only where s is a local unknown."""
     mirror_sd: float = 0.02
@@ -109,6 +114,8 @@ class Priors:
             parallel=self.parallel[index],
             ratio=self.ratio[index],
             ratio_weight=self.ratio_weight[index],
+            lobe=self.lobe[index],
+            lobe_weight=self.lobe_weight[index],
             s_weight=self.s_weight[index],
         )
 
@@ -116,7 +123,8 @@ class Priors:
 def no_priors(pixels: int, like: Tensor) -> Priors:
     """Priors whose rows of single pixels are all switched off."""
     zero = like.new_zeros(pixels)
-    return Priors(shape=0.0, parallel=zero, ratio=zero, ratio_weight=zero, s_weight=zero)
+    lobe = like.new_zeros(pixels, 3)
+    return Priors(shape=0.0, parallel=zero, ratio=zero, ratio_weight=zero, lobe=lobe, lobe_weight=zero, s_weight=zero)
 
 
 @dataclass(frozen=True)
@@ -199,6 +207,8 @@ def pixel_residual(
     along = (whole * s).sum(-1, keepdim=True) / power
     rows.append((priors.parallel[..., None, None] * (whole - along * s)).flatten(-2))
     rows.append(priors.ratio_weight[..., None] * (along[..., 0].mean(-1, keepdim=True) - priors.ratio[..., None]))
+    lobe = x.B[:, None] * x.d.mean(-2) / shared[LOG_C_2].exp()
+    rows.append(priors.lobe_weight[..., None] * (lobe - priors.lobe))
     if x.s is not None:
         rows.append((priors.s_weight[..., None, None] * (x.s - obs.s_basis)).flatten(-2))
     return torch.cat(rows, -1)
@@ -229,7 +239,7 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
     def residual(local: Tensor, shared: Tensor, *data: Tensor) -> Tensor:
         return pixel_residual(local, shared, *regroup(data, obs, priors))
 
-    prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1
+    prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1 + 3
     threshold = None
     if robust is not None:
         picture = obs.images.new_full((obs.images[0].numel(),), robust)
@@ -244,6 +254,8 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
             priors.parallel,
             priors.ratio,
             priors.ratio_weight,
+            priors.lobe,
+            priors.lobe_weight,
             priors.s_weight,
         ),
         threshold=threshold,
@@ -253,8 +265,16 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
 
 def regroup(data: tuple[Tensor, ...], obs: Observations, priors: Priors) -> tuple[Observations, Priors]:
     """The solver's per-block tensors, back in their named places."""
-    images, s, weight, clipped, parallel, ratio, ratio_weight, s_weight = data
+    images, s, weight, clipped, parallel, ratio, ratio_weight, lobe, lobe_weight, s_weight = data
     return (
         replace(obs, images=images, s=s, weight=weight, clipped=clipped),
-        replace(priors, parallel=parallel, ratio=ratio, ratio_weight=ratio_weight, s_weight=s_weight),
+        replace(
+            priors,
+            parallel=parallel,
+            ratio=ratio,
+            ratio_weight=ratio_weight,
+            lobe=lobe,
+            lobe_weight=lobe_weight,
+            s_weight=s_weight,
+        ),
     )

@@ -16,10 +16,18 @@ from torch import Tensor
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.body import extend_into_shadow, robust_body
-from reflectsep.fit.expectations import first_priors, near_maximum, noise_level, shape_spread, with_ratio
+from reflectsep.fit.expectations import (
+    first_priors,
+    near_maximum,
+    noise_level,
+    shape_spread,
+    unknowns_in_effect,
+    with_ratio,
+)
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.outcome import describe, picture_residual
 from reflectsep.fit.problem import (
+    LOG_C_2,
     ROOT_HAZE,
     SOFTNESS,
     Observations,
@@ -28,6 +36,7 @@ from reflectsep.fit.problem import (
     unpack,
 )
 from reflectsep.fit.search import GRID_N_S, globals_grid, informative_pixels
+from reflectsep.fit.smoothness import predict, scales_of, with_lobe
 from reflectsep.fit.solution import (
     Effort,
     LocalFit,
@@ -37,6 +46,7 @@ from reflectsep.fit.solution import (
     hand_on_lobes,
     initial_shared,
     lobe_pictures,
+    offer_lobes,
 )
 from reflectsep.fit.state import State
 from reflectsep.flags import Flag
@@ -148,8 +158,7 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     if options.prior == "none":
         priors = replace(no_priors(len(obs), obs.images), height=priors.height)
     if options.scattering == "measured" and obs.s_unknown:
-        size = obs.s_basis.square().mean((1, 2)).sqrt()
-        priors = replace(priors, s_weight=1.0 / (options.scattering_sd * size + sigma))
+        priors = replace(priors, s_weight=scattering_weight(obs, options, sigma))
     elif obs.s_unknown:
         priors = replace(priors, parallel=torch.zeros_like(priors.parallel))
         priors = replace(priors, ratio_weight=torch.zeros_like(priors.ratio_weight))
@@ -174,6 +183,11 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
         body=body,
         found=nothing,
     )
+
+
+def scattering_weight(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels"]:
+    """1 / standard deviation of the measured s: that of the method, and the noise of its frames."""
+    return 1.0 / (options.scattering_sd * obs.s_basis.square().mean((1, 2)).sqrt() + sigma)
 
 
 def weights(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels channels lights"]:
@@ -216,15 +230,30 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         progress("pixels", i + 1, 3)
         found = hand_on_lobes(obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius)
     progress("pixels", 3, 3)
-    return with_noise_of_fit(replace(state, found=found), options)
+    state = with_noise_of_fit(replace(state, found=found), options)
+    if options.prior == "auto":
+        # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
+        vote = (state.found.cost <= state.found.cost.quantile(effort.trim)).nonzero()[:, 0]
+        shine = lobe_pictures(obs, state.found.local, state.shared)[vote]
+        spread = shape_spread(obs.take(vote), state.found.local[vote], state.shared, shine, state.sigma)
+        shape = max(state.priors.shape, 1.0 / spread)
+        state = rescored(replace(state, priors=replace(state.priors, shape=shape)))
+    return state
 
 
 def with_noise_of_fit(state: State, options: FitOptions) -> State:
     """The noise as the fit itself leaves it: the first figure, from before any lobe was known, is too large."""
     misfit = picture_residual(state)
-    sigma = noise_level(state.obs.images, misfit, 4)
-    obs = replace(state.obs, weight=weights(state.obs, options, sigma))
-    return rescored(replace(state, obs=obs, sigma=sigma))
+    unknowns = unknowns_in_effect(state.obs, state.priors, state.found.local, state.shared)
+    return with_noise(state, options, noise_level(state.obs.images, misfit, unknowns))
+
+
+def with_noise(state: State, options: FitOptions, sigma: float) -> State:
+    """`state` with another noise level, in the pictures' weights and in whatever prior goes by it."""
+    obs, priors = replace(state.obs, weight=weights(state.obs, options, sigma)), state.priors
+    if options.scattering == "measured" and obs.s_unknown:
+        priors = replace(priors, s_weight=scattering_weight(obs, options, sigma))
+    return rescored(replace(state, obs=obs, priors=priors, sigma=sigma))
 
 
 def refine(state: State, options: FitOptions, progress: Progress) -> State:
@@ -239,7 +268,21 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
             priors = with_ratio(state.priors, state.obs, whole, state.mask)
             state = rescored(replace(state, priors=priors))
             state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1}", progress)
-    return rescored(hand_on(state, 1))
+    return smooth_lobes(rescored(hand_on(state, 1)), options, progress)
+
+
+def smooth_lobes(state: State, options: FitOptions, progress: Progress) -> State:
+    """The lobes of the neighbourhood, at finer and finer scales; how smooth they are is learnt before it has a say."""
+    scales = scales_of(state) if options.prior == "auto" else []
+    for i, (scale, spread) in enumerate(scales):
+        prediction = predict(state, scale, spread)
+        if prediction is None:
+            continue
+        state = rescored(replace(state, priors=with_lobe(state.priors, prediction)))
+        vector = prediction.lobe * state.shared[LOG_C_2].exp()
+        found = offer_lobes(state.obs, state.priors, state.found, state.shared, vector, state.effort, state.robust)
+        state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1}", progress)
+    return state
 
 
 def joint_step(state: State, stage: str, progress: Progress) -> State:

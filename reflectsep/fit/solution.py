@@ -194,6 +194,20 @@ def hand_on_lobes(
     """
     x = unpack(found.local, obs.channels)
     lobe_vector = local_median(x.B[:, None] * x.d.mean(1), mask, radius)
+    return offer_lobes(obs, priors, found, shared, lobe_vector, effort, robust)
+
+
+def offer_lobes(
+    obs: Observations,
+    priors: Priors,
+    found: LocalFit,
+    shared: Float[Tensor, "8"],
+    lobe_vector: Float[Tensor, "pixels 3"],
+    effort: Effort,
+    robust: float | None,
+) -> LocalFit:
+    """Every pixel from the start whose lobe B d is `lobe_vector`, where that ends cheaper than what was found."""
+    x = unpack(found.local, obs.channels)
     globals_ = unpack_globals(shared, obs.n_d)
     shine = lobe(globals_.a + lobe_vector, globals_.n_s, globals_.haze)
     s = obs.s_basis if x.s is None else x.s

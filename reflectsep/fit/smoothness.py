@@ -1,0 +1,132 @@
+"""The lobe as a pixel's neighbours have it: a smooth surface has a smooth lobe, whatever its albedo.
+
+B d_k / C_2 = (N.V)(N.L_k) is a matter of shape alone (Eqs. 6, 7 and 18). Pixel by pixel, a faint highlight and a
+little more diffuse light look the same; whole patches end in the same wrong split. From the pixels around it a
+quadratic surface predicts a pixel's lobe, and how well it predicts those whose lobe is well seen says how firmly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from reflectsep.fit.expectations import VISIBLE
+from reflectsep.fit.neighbours import local_quadratic
+from reflectsep.fit.problem import LOG_C_2, Observations, Priors, build_problem, unpack
+from reflectsep.fit.solution import lobe_pictures
+from reflectsep.fit.state import State
+from reflectsep.solve.joint import inverse
+from reflectsep.solve.local import normal_equations
+from reflectsep.solve.problem import robust_weight
+
+SCALES_PX = (3.0, 2.0, 1.5, 1.0)
+"""Widths of the windows, the widest first: patches in a wrong minimum are overruled from outside."""
+REPEATS = 2
+"""Further rounds at the scale that predicts best."""
+LEAST_SD = 0.003
+"""No neighbourhood is believed more closely than this, in units of (N.V)(N.L)."""
+LEAST_SEEN = 100
+"""Pixels with a clear lobe that it takes to learn how smooth the surface is."""
+MEDIAN_OF_CHI_SQUARED = 0.789
+"""Of a mean of three squares of unit normal variables."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the neighbours say of every pixel."""
+
+    lobe: Float[Tensor, "pixels 3"]
+    variance: Float[Tensor, "pixels"]
+    """Of the prediction itself, by the neighbours' own uncertainty."""
+    spread: float
+    """Standard deviation of a true lobe about such a prediction."""
+    error: float
+    """Root mean square error of predicting a lobe that is well seen, `spread` and `variance` together."""
+
+
+def normalised_lobe(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels 3"]:
+    """B mean_c d / C_2."""
+    x = unpack(local, obs.channels)
+    return x.B[:, None] * x.d.mean(1) / shared[LOG_C_2].exp()
+
+
+def lobe_variance(state: State) -> Float[Tensor, "pixels"]:
+    """Variance of the normalised lobe by each pixel's own pictures, the mean over its three components."""
+    obs = state.obs
+    priors = replace(state.priors, lobe_weight=torch.zeros_like(state.priors.lobe_weight))
+    parts = []
+    for start in range(0, len(obs), state.effort.chunk):
+        index = torch.arange(start, min(start + state.effort.chunk, len(obs)))
+        problem = build_problem(obs.take(index), priors.take(index), robust=state.robust)
+        local = state.found.local[index]
+        r, J = problem.linearise_local(local, state.shared)
+        V, _ = normal_equations(r, J, robust_weight(r, problem.threshold))
+        x = unpack(local, obs.channels)
+        slope = local.new_zeros(len(index), 3, local.shape[1])
+        for k in range(3):
+            slope[:, k, k : 3 * obs.channels : 3] = x.B[:, None] / obs.channels
+            slope[:, k, 3 * obs.channels] = x.B * x.d.mean(1)[:, k]
+        slope = slope / state.shared[LOG_C_2].exp()
+        parts.append(torch.einsum("nkp,npq,nkq->n", slope, inverse(V), slope) / 3.0)
+    return torch.cat(parts)
+
+
+def clearly_seen(state: State, variance: Tensor) -> Bool[Tensor, "pixels"]:
+    """Pixels whose lobe is well above the noise in two pictures, and well determined."""
+    shine = lobe_pictures(state.obs, state.found.local, state.shared)
+    seen = (shine > 2.0 * VISIBLE * state.sigma).sum(-1) >= 2
+    if not bool(seen.any()):
+        return seen
+    return seen & (variance < 4.0 * variance[seen].median())
+
+
+def predict(state: State, scale_px: float, spread: float | None = None) -> Prediction | None:
+    """Every pixel's lobe from its neighbours; None where too few lobes are seen to learn `spread`.
+
+    Neighbours count by their certainty, and less the farther they are from what their own neighbours say.
+    """
+    lobe = normalised_lobe(state.obs, state.found.local, state.shared)
+    own = lobe_variance(state)
+    seen = clearly_seen(state, own)
+    if spread is None and int(seen.sum()) < LEAST_SEEN:
+        return None
+    square = 1e-4 if spread is None else spread**2
+    trust = torch.ones_like(own)
+    predicted, variance = lobe, own
+    for _ in range(4):
+        predicted, variance = local_quadratic(lobe, trust / (own + square), state.mask, scale_px)
+        error = (lobe - predicted).square().mean(-1)
+        if spread is None:
+            total = float(error[seen].median()) / MEDIAN_OF_CHI_SQUARED
+            square = max(total - float(own[seen].median()), LEAST_SD**2)
+        trust = (1.0 + error / (4.0 * (own + square + variance))).square().reciprocal()
+    error = (square + float(variance[seen].median())) ** 0.5 if bool(seen.any()) else square**0.5
+    return Prediction(predicted, variance, square**0.5, error)
+
+
+def scales_of(state: State) -> list[tuple[float, float]]:
+    """Scales to go through with the spread of each: down to the one that predicts best, and some more rounds there.
+
+    On a rough surface or in noise a narrow window follows its few neighbours' errors; on a finely curved one a wide
+    window is no surface at all.
+    """
+    known = [(scale, found) for scale in SCALES_PX if (found := predict(state, scale)) is not None]
+    if not known:
+        return []
+    best = min(range(len(known)), key=lambda i: known[i][1].error)
+    order = [*range(best + 1), *[best] * REPEATS]
+    return [(known[i][0], known[i][1].spread) for i in order]
+
+
+def with_lobe(priors: Priors, prediction: Prediction) -> Priors:
+    """`priors` with the lobe row."""
+    weight = (prediction.spread**2 + prediction.variance).rsqrt()
+    sound = weight.isfinite() & prediction.lobe.isfinite().all(-1)
+    return replace(
+        priors,
+        lobe=torch.where(sound[:, None], prediction.lobe, 0.0),
+        lobe_weight=torch.where(sound, weight, 0.0),
+    )
