@@ -157,6 +157,8 @@ def slab_frames(
     """
     u = slab_coordinate(points, light, axis)
     ratio = width_px / step_px
+    # A multiple of the step, divided by it again, may miss the whole number by its last bit.
+    ratio = float(round(ratio)) if abs(ratio - round(ratio)) < 1e-12 * ratio else ratio
     first = float(u.min())
     # In steps since frame 0. Half-open intervals and whole shifts of one float: i <= t < i + ratio counts exactly.
     t = (u - first) / step_px + (math.ceil(ratio) - 1 + MARGIN_FRAMES)

@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reflectsep.fit.neighbours import local_median, neighbourhood, smooth, to_map
+from reflectsep.fit.neighbours import QUADRATIC, local_median, local_quadratic, neighbourhood, smooth, to_map
 
 
 def some_mask():
@@ -79,3 +80,39 @@ def test_the_window_leaves_the_pixel_out():
     window = neighbourhood(some_values(mask), mask, 1)
     assert window.shape == (int(mask.sum()), 2, 8)
     assert window[0].isnan().any()  # at the mask's edge
+
+
+def test_a_quadratic_surface_is_predicted_from_its_other_pixels():
+    mask = torch.ones(14, 15, dtype=torch.bool)
+    mask[0, :4], mask[7, 7] = False, False
+    y, x = (c.double() / 10 for c in mask.nonzero(as_tuple=True))
+    surface = torch.stack([0.3 - x + 2 * y + x * x - 0.5 * x * y + 0.7 * y * y, 1 + x * y], 1)
+    spoilt = surface.clone()
+    # Its own value has no say: a wrong pixel is predicted as if it were right.
+    spoilt[100] += 5.0
+    weight = torch.ones(len(x), dtype=torch.float64)
+    weight[100] = 0.0
+    predicted, _ = local_quadratic(spoilt, weight, mask, 2.0)
+    # The trace of a ridge costs most in the corners.
+    tolerance = 2e-3 * float(surface.amax() - surface.amin())
+    assert float((predicted - surface).abs().max()) < tolerance
+    alone, _ = local_quadratic(spoilt, torch.ones_like(weight), mask, 2.0)
+    torch.testing.assert_close(alone[100], surface[100], rtol=0, atol=tolerance)
+
+
+def test_the_prediction_is_the_weighted_regression_with_its_variance():
+    mask = some_mask()
+    values, weight = some_values(mask, 1), some_values(mask)[:, 1] + 0.2
+    y, x = (c.double() for c in mask.nonzero(as_tuple=True))
+    predicted, variance = local_quadratic(values, weight, mask, 1.5)
+    for i in (3, 30, 60):
+        dx, dy = (x - x[i]) / 1.5, (y - y[i]) / 1.5
+        near = (dx.abs() * 1.5 <= 4) & (dy.abs() * 1.5 <= 4)
+        near[i] = False
+        w = (weight * torch.exp(-0.5 * (dx**2 + dy**2)))[near]
+        design = torch.stack([dx**a * dy**b for a, b in QUADRATIC], 1)[near]
+        normal = design.T @ (w[:, None] * design)
+        expected = torch.linalg.solve(normal, design.T @ (w * values[near, 0]))[0]
+        # A trace of a ridge is all that sets the two apart.
+        assert float(predicted[i, 0] - expected) == pytest.approx(0.0, abs=0.02)
+        assert float(variance[i]) == pytest.approx(float(torch.linalg.inv(normal)[0, 0]), rel=0.02)

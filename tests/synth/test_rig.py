@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from reflectsep.data import Light
@@ -21,6 +21,7 @@ from reflectsep.synth.rig import RIGS, SimulatedCamera, SimulatedRig, direction,
     st.floats(0.13, 7.0),
     st.integers(0, 99),
 )
+@example(0.0, 0.0, "x", 3, 2.884952440348699, 0)  # 3 steps over a step is 3.0000000000000004
 def test_every_point_is_lit_in_exactly_width_over_step_frames(tilt, azimuth, axis, ratio, step, seed):
     points = torch.rand(300, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 90 - 45
     lit = slab_frames(points, direction(tilt, azimuth), axis, ratio * step, step)
