@@ -24,6 +24,9 @@ from reflectsep.solve.problem import robust_weight
 
 SCALES_PX = (3.0, 2.0, 1.5, 1.0)
 """Widths of the windows, the widest first: patches in a wrong minimum are overruled from outside."""
+WORTH = 1.5
+"""Neighbours have a say where they predict a clear lobe to within this many of its own standard deviations: where the
+pictures say more, as without noise, they would only blur it."""
 REPEATS = 2
 """Further rounds at the scale that predicts best."""
 LEAST_SD = 0.003
@@ -45,6 +48,8 @@ class Prediction:
     """Standard deviation of a true lobe about such a prediction."""
     error: float
     """Root mean square error of predicting a lobe that is well seen, `spread` and `variance` together."""
+    own: float
+    """Standard deviation of such a lobe by its own pictures."""
 
 
 def normalised_lobe(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels 3"]:
@@ -103,8 +108,9 @@ def predict(state: State, scale_px: float, spread: float | None = None) -> Predi
             total = float(error[seen].median()) / MEDIAN_OF_CHI_SQUARED
             square = max(total - float(own[seen].median()), LEAST_SD**2)
         trust = (1.0 + error / (4.0 * (own + square + variance))).square().reciprocal()
-    error = (square + float(variance[seen].median())) ** 0.5 if bool(seen.any()) else square**0.5
-    return Prediction(predicted, variance, square**0.5, error)
+    clear = seen if bool(seen.any()) else torch.ones_like(seen)
+    error, alone = (square + float(variance[clear].median())) ** 0.5, float(own[clear].median()) ** 0.5
+    return Prediction(predicted, variance, square**0.5, error, alone)
 
 
 def scales_of(state: State) -> list[tuple[float, float]]:
@@ -117,6 +123,8 @@ def scales_of(state: State) -> list[tuple[float, float]]:
     if not known:
         return []
     best = min(range(len(known)), key=lambda i: known[i][1].error)
+    if known[best][1].error > WORTH * known[best][1].own:
+        return []
     order = [*range(best + 1), *[best] * REPEATS]
     return [(known[i][0], known[i][1].spread) for i in order]
 

@@ -71,6 +71,11 @@ def test_the_neighbours_overrule_a_wrong_lobe(at_truth):
     assert float((found.lobe - lobe)[patch].abs().mean()) < 0.3 * float((spoilt - lobe)[patch].abs().mean())
 
 
+def test_neighbours_have_no_say_where_the_pictures_say_more(at_truth):
+    state, _ = at_truth
+    assert scales_of(with_noise(state, EXACT, 0.0001)) == []
+
+
 def test_without_a_lobe_nothing_is_learnt(at_truth):
     state, _ = at_truth
     assert predict(replace(state, sigma=10.0), 2.0) is None
