@@ -103,23 +103,17 @@ def relative(found, wanted, mask):
 
 
 @pytest.mark.slow
-def test_scattering_of_a_captured_wax_is_that_of_the_ideal_capture(tmp_path):
+def test_components_of_a_captured_wax_are_those_of_the_ideal_capture(tmp_path):
     made = job(tmp_path / "taken", size=96, read_noise=0.0005, shot_noise=0.002)
     capture(made, silent)
     write(SimulateJob(object=made.object, rig=made.rig, out=str(tmp_path / "ideal")), silent)
     found, wanted = (fit(load_capture(tmp_path / name)) for name in ("taken", "ideal"))
     assert torch.equal(found.mask, wanted.mask)
-    assert relative(found.scattering, wanted.scattering, wanted.mask) < 0.05
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(reason="13 %: another draw of the slab frames' noise alone moves it by 8 %", strict=True)
-def test_specular_of_a_captured_wax_is_that_of_the_ideal_capture(tmp_path):
-    made = job(tmp_path / "taken", size=96, read_noise=0.0005, shot_noise=0.002)
-    capture(made, silent)
-    write(SimulateJob(object=made.object, rig=made.rig, out=str(tmp_path / "ideal")), silent)
-    found, wanted = (fit(load_capture(tmp_path / name)) for name in ("taken", "ideal"))
-    assert relative(found.specular, wanted.specular, wanted.mask) < 0.05
+    scattering = relative(found.scattering, wanted.scattering, wanted.mask)
+    specular = relative(found.specular, wanted.specular, wanted.mask)
+    print(f"scattering {100 * scattering:.1f} %, specular {100 * specular:.1f} %")
+    assert scattering < 0.05
+    assert specular < 0.05
 
 
 def test_backend_settings_on_the_command_line_may_be_new_and_are_checked_by_the_backend(tmp_path, capsys):

@@ -34,7 +34,6 @@ def test_clean_pictures_give_the_truth_back(paper_case, lights):
     assert float(fit.n_s) == pytest.approx(case.truth.n_s, rel=0.05)
 
 
-@pytest.mark.xfail(reason="a few pixels of a hundred stay in wrong minima on this surface: three times the cost")
 def test_the_cost_is_no_higher_than_from_a_start_at_the_truth(paper_case):
     case = paper_case(size=32)
     obs, mask, _ = observe(case.stack, case.scattering, EXACT, torch.float64)
