@@ -231,7 +231,7 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         found = hand_on_lobes(obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius)
     progress("pixels", 3, 3)
     state = with_noise_of_fit(replace(state, found=found), options)
-    if options.prior == "auto":
+    if options.prior == "auto" and obs.lights_known:
         # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
         vote = (state.found.cost <= state.found.cost.quantile(effort.trim)).nonzero()[:, 0]
         shine = lobe_pictures(obs, state.found.local, state.shared)[vote]
