@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.neighbours import MAD_TO_SD, smooth
-from reflectsep.fit.problem import LOG_C_2, Observations, Priors, build_problem, log_shape, no_priors, unpack
+from reflectsep.fit.problem import Observations, Priors, no_priors, shape_row, unpack
 from reflectsep.solve.joint import inverse
 from reflectsep.solve.local import normal_equations
 
@@ -120,7 +121,7 @@ def shape_spread(
 ) -> float:
     """Scatter of log B about its geometric value over the pixels whose lobe is well seen."""
     x = unpack(local, obs.channels)
-    row = x.log_B + log_shape(x.d.mean(-2), obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
+    row = shape_row(x.log_B, x.d.mean(-2), shared, obs)
     # Well seen: in two pictures or more, and well above the noise.
     seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
     first = SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD

@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from reflectsep.data import Fit, PhotometricStack, Scattering
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     SHARED_NAMES,
-    build_problem,
     pixel_residual,
     unpack,
     unpack_globals,

@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.model import Globals, edge_width, reflectance
-from reflectsep.solve.problem import BlockProblem
 
 SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haze", "log_n_d")
 LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
@@ -180,6 +179,16 @@ def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: boo
     return (g.square().sum(-1) + 1e-6).log() - facing.log()
 
 
+def shape_row(log_B: Tensor, d_mean: Float[Tensor, "*pixels 3"], shared: Tensor, obs: Observations) -> Tensor:
+    """Log B less its value by the lobe's geometry; 0 on a surface of one gloss."""
+    return log_B + log_shape(d_mean, obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
+
+
+def normalised_lobe(x: Locals, shared: Tensor) -> Float[Tensor, "pixels 3"]:
+    """B mean_c d / C_2, which is (N.V)(N.L_k): a matter of shape alone."""
+    return x.B[:, None] * x.d.mean(-2) / shared[LOG_C_2].exp()
+
+
 def pixel_residual(
     local: Tensor, shared: Tensor, obs: Observations, priors: Priors
 ) -> Float[Tensor, "pixels residuals"]:
@@ -200,15 +209,13 @@ def pixel_residual(
     misfit = torch.where(obs.clipped, misfit.clamp_max(0.0), misfit)
     rows = [(misfit * obs.weight).flatten(-2)]
 
-    shape = x.log_B + log_shape(x.d.mean(-2), obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
-    rows.append((priors.shape * shape)[..., None])
+    rows.append((priors.shape * shape_row(x.log_B, x.d.mean(-2), shared, obs))[..., None])
 
     whole, power = x.d + s, s.square().sum(-1, keepdim=True) + 1e-9
     along = (whole * s).sum(-1, keepdim=True) / power
     rows.append((priors.parallel[..., None, None] * (whole - along * s)).flatten(-2))
     rows.append(priors.ratio_weight[..., None] * (along[..., 0].mean(-1, keepdim=True) - priors.ratio[..., None]))
-    lobe = x.B[:, None] * x.d.mean(-2) / shared[LOG_C_2].exp()
-    rows.append(priors.lobe_weight[..., None] * (lobe - priors.lobe))
+    rows.append(priors.lobe_weight[..., None] * (normalised_lobe(x, shared) - priors.lobe))
     if x.s is not None:
         rows.append((priors.s_weight[..., None, None] * (x.s - obs.s_basis)).flatten(-2))
     return torch.cat(rows, -1)
@@ -230,51 +237,4 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             shared[SOFTNESS] / priors.softness_sd,
             shared[ROOT_HAZE] / priors.haze_sd,
         ]
-    )
-
-
-def build_problem(obs: Observations, priors: Priors, *, robust: float | None) -> BlockProblem:
-    """The whole problem; `robust` is the Huber threshold of the pictures' residuals in standard deviations."""
-
-    def residual(local: Tensor, shared: Tensor, *data: Tensor) -> Tensor:
-        return pixel_residual(local, shared, *regroup(data, obs, priors))
-
-    prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1 + 3
-    threshold = None
-    if robust is not None:
-        picture = obs.images.new_full((obs.images[0].numel(),), robust)
-        threshold = torch.cat([picture, picture.new_full((prior_rows,), torch.inf)])
-    return BlockProblem(
-        residual=residual,
-        data=(
-            obs.images,
-            obs.s,
-            obs.weight,
-            obs.clipped,
-            priors.parallel,
-            priors.ratio,
-            priors.ratio_weight,
-            priors.lobe,
-            priors.lobe_weight,
-            priors.s_weight,
-        ),
-        threshold=threshold,
-        shared_residual=lambda shared: shared_residual(shared, obs.cosine, priors),
-    )
-
-
-def regroup(data: tuple[Tensor, ...], obs: Observations, priors: Priors) -> tuple[Observations, Priors]:
-    """The solver's per-block tensors, back in their named places."""
-    images, s, weight, clipped, parallel, ratio, ratio_weight, lobe, lobe_weight, s_weight = data
-    return (
-        replace(obs, images=images, s=s, weight=weight, clipped=clipped),
-        replace(
-            priors,
-            parallel=parallel,
-            ratio=ratio,
-            ratio_weight=ratio_weight,
-            lobe=lobe,
-            lobe_weight=lobe_weight,
-            s_weight=s_weight,
-        ),
     )

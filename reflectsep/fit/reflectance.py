@@ -15,6 +15,7 @@ from torch import Tensor
 
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.body import extend_into_shadow, robust_body
 from reflectsep.fit.expectations import (
     first_priors,
@@ -31,7 +32,6 @@ from reflectsep.fit.problem import (
     ROOT_HAZE,
     SOFTNESS,
     Observations,
-    build_problem,
     no_priors,
     unpack,
 )

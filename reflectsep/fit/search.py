@@ -14,7 +14,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.fit.problem import LOG_C_2, LOG_N_S, SOFTNESS, Observations, Priors, log_shape, unpack_globals
+from reflectsep.fit.problem import (
+    LOG_C_2,
+    LOG_N_S,
+    SOFTNESS,
+    Observations,
+    Priors,
+    log_shape,
+    shape_row,
+    unpack_globals,
+)
 from reflectsep.model import Globals, diffuse, edge_width, lobe, reflectance, signed_root
 
 GRID_N_S = (3.0, 4.5, 6.5, 9.0, 13.0, 19.0, 28.0, 42.0, 65.0, 100.0)
@@ -101,8 +110,7 @@ def scan(
     misfit = torch.where(mean.clipped[:, 0, None], misfit.clamp_max(0.0), misfit)
     scaled = (misfit * mean.weight[:, 0, None]).abs()
     cost = torch.where(scaled < robust, 0.5 * scaled.square(), robust * (scaled - 0.5 * robust)).sum(-1)
-    shape = log_B + log_shape(d, obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
-    cost = cost + 0.5 * (priors.shape * shape).square()
+    cost = cost + 0.5 * (priors.shape * shape_row(log_B, d, shared, obs)).square()
     ends = torch.nn.functional.pad(cost, (1, 1), value=torch.inf)
     minimum = (cost <= ends[:, :-2]) & (cost <= ends[:, 2:])
     best, index = torch.where(minimum, cost, torch.inf).topk(keep, largest=False, dim=1)

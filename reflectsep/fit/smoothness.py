@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.expectations import VISIBLE
 from reflectsep.fit.neighbours import local_quadratic
-from reflectsep.fit.problem import LOG_C_2, Observations, Priors, build_problem, unpack
+from reflectsep.fit.problem import LOG_C_2, Priors, normalised_lobe, unpack
 from reflectsep.fit.solution import lobe_pictures
 from reflectsep.fit.state import State
 from reflectsep.solve.joint import inverse
@@ -50,12 +51,6 @@ class Prediction:
     """Root mean square error of predicting a lobe that is well seen, `spread` and `variance` together."""
     own: float
     """Standard deviation of such a lobe by its own pictures."""
-
-
-def normalised_lobe(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels 3"]:
-    """B mean_c d / C_2."""
-    x = unpack(local, obs.channels)
-    return x.B[:, None] * x.d.mean(1) / shared[LOG_C_2].exp()
 
 
 def lobe_variance(state: State) -> Float[Tensor, "pixels"]:
@@ -93,7 +88,7 @@ def predict(state: State, scale_px: float, spread: float | None = None) -> Predi
 
     Neighbours count by their certainty, and less the farther they are from what their own neighbours say.
     """
-    lobe = normalised_lobe(state.obs, state.found.local, state.shared)
+    lobe = normalised_lobe(unpack(state.found.local, state.obs.channels), state.shared)
     own = lobe_variance(state)
     seen = clearly_seen(state, own)
     if spread is None and int(seen.sum()) < LEAST_SEEN:

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.neighbours import local_median
 from reflectsep.fit.problem import (
     LOG_N_D,
@@ -18,7 +19,6 @@ from reflectsep.fit.problem import (
     Locals,
     Observations,
     Priors,
-    build_problem,
     unpack,
     unpack_globals,
 )

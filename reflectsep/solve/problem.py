@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.func import jvp, vmap
 
 Residual = Callable[..., Tensor]
-Jacobians = Callable[..., tuple[Tensor, Tensor, Tensor]]
+Jacobians = Callable[..., tuple[Tensor, Tensor, Tensor | None]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,8 @@ class BlockProblem:
     shared_residual: Callable[[Tensor], Tensor] | None = None
     """q: residuals of the shared parameters alone, (G,) -> (R,)."""
     jacobian: Jacobians | None = None
-    """Closed form: (local, shared, *data) -> r (blocks, M), dr/dl (blocks, M, P), dr/dg (blocks, M, G)."""
+    """Closed form: (local, shared, *data, with_shared=bool) -> r (blocks, M), dr/dl (blocks, M, P), and dr/dg
+    (blocks, M, G) if asked for, else None."""
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -63,13 +64,15 @@ class BlockProblem:
     def linearise(self, local: Tensor, shared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """R and its derivatives by l and by g at (local, shared)."""
         if self.jacobian is not None:
-            return self.jacobian(local, shared, *self.data)
+            r, J, K = self.jacobian(local, shared, *self.data, with_shared=True)
+            assert K is not None  # it was asked for
+            return r, J, K
         return forward_jacobian(self.residual, local, shared, self.data)
 
     def linearise_local(self, local: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
         """R and its derivative by l alone."""
         if self.jacobian is not None:
-            r, J, _ = self.jacobian(local, shared, *self.data)
+            r, J, _ = self.jacobian(local, shared, *self.data, with_shared=False)
             return r, J
         return local_jacobian(self.residual, local, shared, self.data)
 

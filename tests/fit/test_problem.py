@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.expectations import (
     first_priors,
     noise_level,
@@ -18,7 +19,6 @@ from reflectsep.fit.problem import (
     LOG_C_2,
     LOG_N_S,
     Locals,
-    build_problem,
     log_shape,
     no_priors,
     pixel_residual,

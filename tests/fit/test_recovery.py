@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
-from reflectsep.fit.problem import LOG_C_2, LOG_N_S, Locals, build_problem
+from reflectsep.fit.problem import LOG_C_2, LOG_N_S, Locals
 from reflectsep.fit.reflectance import fit_reflectance, observe, prepare, refine, rescored, start
 from reflectsep.fit.solution import LocalFit
 from reflectsep.progress import silent

@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.expectations import noise_level, unknowns_in_effect
 from reflectsep.fit.options import FitOptions
-from reflectsep.fit.problem import LOG_C_2, LOG_N_S, Locals, build_problem, no_priors
+from reflectsep.fit.problem import LOG_C_2, LOG_N_S, Locals, no_priors, normalised_lobe, unpack
 from reflectsep.fit.reflectance import observe, prepare, with_noise
-from reflectsep.fit.smoothness import SCALES_PX, lobe_variance, normalised_lobe, predict, scales_of, with_lobe
+from reflectsep.fit.smoothness import SCALES_PX, lobe_variance, predict, scales_of, with_lobe
 from reflectsep.fit.solution import LocalFit, offer_lobes
 
 EXACT = FitOptions(scattering_sd=0.0)
@@ -37,7 +38,7 @@ def with_cost(state):
 
 def test_the_lobe_of_a_truth_is_shape_alone(at_truth, paper_case):
     state, lobe = at_truth
-    torch.testing.assert_close(normalised_lobe(state.obs, state.found.local, state.shared), lobe)
+    torch.testing.assert_close(normalised_lobe(unpack(state.found.local, state.obs.channels), state.shared), lobe)
     normals = paper_case(size=40, sigma=0.002).truth.surface.normals[:, state.mask].T
     towards = torch.linalg.inv(state.obs.normal_map)
     # (N.V)(N.L_k): no albedo in it.
@@ -66,7 +67,7 @@ def test_the_neighbours_overrule_a_wrong_lobe(at_truth):
     bad = replace(state, found=replace(state.found, local=wrong))
     found = predict(bad, 1.5, 0.01)
     assert found is not None
-    spoilt = normalised_lobe(bad.obs, wrong, bad.shared)
+    spoilt = normalised_lobe(unpack(wrong, bad.obs.channels), bad.shared)
     assert float((spoilt - lobe)[patch].abs().mean()) > 0.1
     assert float((found.lobe - lobe)[patch].abs().mean()) < 0.3 * float((spoilt - lobe)[patch].abs().mean())
 
@@ -94,7 +95,7 @@ def test_the_row_weighs_by_spread_and_variance_and_never_carries_nan(at_truth):
     expected = 1.0 / (found.spread**2 + found.variance).sqrt()
     torch.testing.assert_close(priors.lobe_weight[6:], expected[6:])
     rows = build_problem(state.obs, priors, robust=None).residuals(state.found.local, state.shared)
-    off = normalised_lobe(state.obs, state.found.local, state.shared) - priors.lobe
+    off = normalised_lobe(unpack(state.found.local, state.obs.channels), state.shared) - priors.lobe
     torch.testing.assert_close(rows[:, -3:], priors.lobe_weight[:, None] * off)
 
 
@@ -119,7 +120,7 @@ def test_the_variance_of_a_lobe_is_that_of_repeated_noise(at_truth):
             state.effort,
             None,
         )
-        squares.append((normalised_lobe(obs, moved.local, state.shared) - lobe).square().mean(-1))
+        squares.append((normalised_lobe(unpack(moved.local, obs.channels), state.shared) - lobe).square().mean(-1))
         state = replace(state, found=replace(state.found, cost=torch.full_like(state.found.cost, torch.inf)))
     measured = torch.stack(squares).mean(0).median()
     # Weights of Eq. 22 and priors make the stated figure an approximation.

@@ -52,8 +52,9 @@ def test_forward_jacobian_agrees_with_finite_differences():
 def test_a_closed_form_jacobian_is_used_where_given():
     local, shared, x = some_blocks()
     given_form = (torch.ones(7, 5), torch.ones(7, 5, 2), torch.ones(7, 5, 2))
-    problem = BlockProblem(residual=bend, data=(x,), jacobian=lambda *_: given_form)
-    assert problem.linearise(local, shared) is given_form
+    problem = BlockProblem(residual=bend, data=(x,), jacobian=lambda *_, with_shared: given_form)
+    assert all(a is b for a, b in zip(problem.linearise(local, shared), given_form, strict=True))
+    assert all(a is b for a, b in zip(problem.linearise_local(local, shared), given_form[:2], strict=True))
 
 
 def test_take_cuts_data_and_keeps_the_rest():

@@ -1,0 +1,193 @@
+"""Closed-form derivatives of `fit/problem.py`'s residuals: the same numbers as forward mode, several times sooner.
+
+With x_cj = sum_k A_jk (d_ck + s_ck), u_j = sum_k A_jk (a_k + B mean_c d_ck), P' and F' the slopes of the diffuse part
+and of the lobe:
+
+    dI_cj / dd_c'k = A_jk (P'_cj [c = c'] + F'_j B / C)        dI_cj / dlog B = F'_j B sum_k A_jk mean_c d_ck
+    dI_cj / ds_ck  = A_jk P'_cj                                dI_cj / da_k   = F'_j A_jk
+
+Forward mode costs one evaluation for every unknown; here all columns share what is expensive, the powers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from reflectsep.fit.problem import (
+    LOG_C_2,
+    LOG_N_D,
+    LOG_N_S,
+    ROOT_HAZE,
+    SHARED_NAMES,
+    SOFTNESS,
+    Locals,
+    Observations,
+    Priors,
+    normalised_lobe,
+    pixel_residual,
+    unpack,
+    unpack_globals,
+)
+from reflectsep.model import HAZE_RATIO, Globals, edge_width, lobe_argument
+
+
+@dataclass(frozen=True)
+class LobeSlopes:
+    """Derivatives of the off-specular picture."""
+
+    by_u: Float[Tensor, "pixels lights"]
+    by_log_n_s: Float[Tensor, "pixels lights"]
+    by_root_haze: Float[Tensor, "pixels lights"]
+
+
+@dataclass(frozen=True)
+class BodySlopes:
+    """Derivatives of the whole diffuse picture."""
+
+    by_root: Float[Tensor, "pixels channels lights"]
+    by_width: Float[Tensor, "pixels channels lights"]
+    by_log_n_d: Float[Tensor, "pixels channels lights"]
+
+
+def lobe_slopes(u: Float[Tensor, "pixels lights"], shared: Globals) -> LobeSlopes:
+    """Of u^n_s + h u^(n_s / 8), zero where u <= 0."""
+    lit = u > 0
+    safe = torch.where(lit, u, torch.ones_like(u))
+    log = safe.log()
+    narrow = torch.where(lit, (shared.n_s * log).exp(), 0.0)
+    by_u, by_n = narrow, narrow
+    by_haze = torch.zeros_like(u)
+    if float(shared.haze) > 0:
+        wide = torch.where(lit, (shared.n_s / HAZE_RATIO * log).exp(), 0.0)
+        by_u = by_n = narrow + shared.haze / HAZE_RATIO * wide
+        by_haze = 2.0 * shared.haze.sqrt() * wide
+    return LobeSlopes(shared.n_s * by_u / safe, shared.n_s * by_n * log, by_haze)
+
+
+def body_slopes(root: Float[Tensor, "pixels channels lights"], width: Tensor, n_d: Tensor | float) -> BodySlopes:
+    """Of pos(x)^n_d, pos(x) = (x + sqrt(x^2 + e^2)) / 2."""
+    length = (root.square() + width.square() + torch.finfo(root.dtype).tiny).sqrt()
+    by_root, by_width = 0.5 + 0.5 * root / length, 0.5 * width / length
+    if isinstance(n_d, float) and n_d == 1.0:
+        return BodySlopes(by_root, by_width, torch.zeros_like(root))
+    positive = 0.5 * (root + length)
+    lit = positive > 0
+    safe = torch.where(lit, positive, torch.ones_like(positive))
+    power = torch.where(lit, safe**n_d, 0.0)
+    slope = n_d * power / safe
+    return BodySlopes(slope * by_root, slope * by_width, n_d * power * safe.log())
+
+
+def shape_slope(d_mean: Float[Tensor, "pixels 3"], obs: Observations) -> Float[Tensor, "pixels 3"]:
+    """Of `log_shape` by mean_c d."""
+    if not obs.lights_known:
+        mean = d_mean.mean(-1, keepdim=True)
+        # log((m + sqrt(m^2 + e)) / 2) has the slope 1 / sqrt(m^2 + e).
+        return ((mean.square() + 1e-8).rsqrt() / 3.0).expand_as(d_mean)
+    g = d_mean @ obs.normal_map.mT
+    facing = (g @ obs.view)[:, None]
+    by_g = 2.0 * g / (g.square().sum(-1, keepdim=True) + 1e-6) - (facing.square() + 1e-6).rsqrt() * obs.view
+    return by_g @ obs.normal_map
+
+
+def jacobians(
+    local: Tensor, shared: Tensor, obs: Observations, priors: Priors, *, with_shared: bool
+) -> tuple[
+    Float[Tensor, "pixels residuals"],
+    Float[Tensor, "pixels residuals P"],
+    Float[Tensor, "pixels residuals 8"] | None,
+]:
+    """`pixel_residual` and its derivatives by a pixel's own unknowns and by the shared ones (None unless asked for)."""
+    r = pixel_residual(local, shared, obs, priors)
+    x = unpack(local, obs.channels)
+    g = unpack_globals(shared, obs.n_d)
+    pixels, channels, lights = obs.images.shape
+    root = x.d @ obs.alpha.mT + (obs.s if x.s is None else x.s @ obs.alpha.mT)
+    body = body_slopes(root, edge_width(obs.s_basis, shared[SOFTNESS]), g.n_d)
+    shine = lobe_slopes(lobe_argument(x.d, x.B, g.a, obs.alpha), g)
+    # A clipped value that the model exceeds costs nothing, so it pulls nowhere: its residual is exactly 0.
+    pull = obs.weight
+    if bool(obs.clipped.any()):
+        pull = torch.where(obs.clipped & (r[:, : channels * lights].view_as(obs.clipped) == 0), 0.0, obs.weight)
+    J = picture_columns(x, pull, body, shine, obs.alpha, local.shape[1])
+    rows = [J, prior_columns(x, shared, obs, priors, local.shape[1])]
+    if not with_shared:
+        return r, torch.cat(rows, 1), None
+    K = r.new_zeros(pixels, r.shape[1], len(SHARED_NAMES))
+    pictures = K[:, : channels * lights].view(pixels, channels, lights, -1)
+    pictures[..., :3] = (pull * shine.by_u[:, None])[..., None] * obs.alpha
+    pictures[..., LOG_N_S] = pull * shine.by_log_n_s[:, None]
+    pictures[..., ROOT_HAZE] = pull * shine.by_root_haze[:, None]
+    pictures[..., SOFTNESS] = pull * body.by_width * edge_width(obs.s_basis, shared.new_ones(()))
+    if obs.n_d is None:
+        pictures[..., LOG_N_D] = pull * body.by_log_n_d
+    first = channels * lights
+    K[:, first, LOG_C_2] = -priors.shape
+    lobe = first + 2 + 3 * channels
+    K[:, lobe : lobe + 3, LOG_C_2] = -priors.lobe_weight[:, None] * normalised_lobe(x, shared)
+    return r, torch.cat(rows, 1), K
+
+
+def picture_columns(
+    x: Locals, pull: Tensor, body: BodySlopes, shine: LobeSlopes, alpha: Tensor, P: int
+) -> Float[Tensor, "pixels pictures P"]:
+    """Derivatives of the weighted pictures by a pixel's unknowns."""
+    pixels, channels, lights = pull.shape
+    J = pull.new_empty(pixels, channels, lights, P)
+    by_lobe = pull * (shine.by_u * x.B[:, None])[:, None]
+    by_body = (pull * body.by_root)[..., None] * alpha
+    J[..., : 3 * channels] = ((by_lobe / channels)[..., None] * alpha).repeat(1, 1, 1, channels)
+    J[..., 3 * channels] = by_lobe * (x.d.mean(1) @ alpha.mT)[:, None]
+    if x.s is not None:
+        J[..., 3 * channels + 1 :] = 0.0
+    for c in range(channels):
+        J[:, c, :, 3 * c : 3 * c + 3] += by_body[:, c]
+        if x.s is not None:
+            at = 3 * channels + 1 + 3 * c
+            J[:, c, :, at : at + 3] = by_body[:, c]
+    return J.flatten(1, 2)
+
+
+def prior_columns(
+    x: Locals, shared: Tensor, obs: Observations, priors: Priors, P: int
+) -> Float[Tensor, "pixels rows P"]:
+    """Derivatives of the priors' rows by a pixel's unknowns, in the order of `pixel_residual`."""
+    pixels, channels, _ = x.d.shape
+    three, log_B = 3 * channels, 3 * channels
+    own = 0 if x.s is None else three
+    J = x.d.new_zeros(pixels, 1 + three + 1 + 3 + own, P)
+    mean = x.d.mean(1)
+    J[:, 0, :three] = (priors.shape / channels * shape_slope(mean, obs)).repeat(1, channels)
+    J[:, 0, log_B] = priors.shape
+
+    s = obs.s_basis if x.s is None else x.s
+    whole, power = x.d + s, s.square().sum(-1, keepdim=True) + 1e-9
+    along = (whole * s).sum(-1, keepdim=True) / power
+    by_d = s / power
+    by_s = (whole + s - 2.0 * along * s) / power
+    eye = torch.eye(3, dtype=s.dtype)
+    off_d = eye - s[..., :, None] * by_d[..., None, :]
+    off_s = off_d if x.s is None else (1.0 - along[..., None]) * eye - s[..., :, None] * by_s[..., None, :]
+    weight, mean_weight = priors.parallel[:, None, None], (priors.ratio_weight / channels)[:, None]
+    for c in range(channels):
+        rows = slice(1 + 3 * c, 4 + 3 * c)
+        J[:, rows, 3 * c : 3 * c + 3] = weight * off_d[:, c]
+        J[:, 1 + three, 3 * c : 3 * c + 3] = mean_weight * by_d[:, c]
+        if x.s is not None:
+            at = three + 1 + 3 * c
+            J[:, rows, at : at + 3] = weight * off_s[:, c]
+            J[:, 1 + three, at : at + 3] = mean_weight * by_s[:, c]
+
+    lobe = 2 + three
+    strength = priors.lobe_weight[:, None]
+    J[:, lobe : lobe + 3, log_B] = strength * normalised_lobe(x, shared)
+    share = strength[:, 0] * x.B / shared[LOG_C_2].exp() / channels
+    for k in range(3):
+        J[:, lobe + k, k:three:3] = share[:, None]
+    if own:
+        J[:, lobe + 3 :, three + 1 :] = torch.diag_embed(priors.s_weight[:, None].expand(-1, three))
+    return J

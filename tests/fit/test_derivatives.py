@@ -1,0 +1,92 @@
+"""The closed form against forward mode, column by column, wherever the residual has another branch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from reflectsep.fit.blocks import build_problem
+from reflectsep.fit.problem import SHARED_NAMES, Locals, Observations, Priors
+from reflectsep.solve.problem import forward_jacobian
+
+PIXELS, LIGHTS = 40, 7
+
+
+def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clipped=False):
+    """Observations, priors and parameters without any structure; shadows, lobes and clipped values among them."""
+    g = torch.Generator().manual_seed(7)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    basis = torch.nn.functional.normalize(rand(3, 3) - 0.5 + torch.eye(3), dim=-1)
+    view = torch.tensor([0.1, -0.05, 1.0], dtype=torch.float64)
+    images = rand(PIXELS, channels, LIGHTS)
+    alpha = torch.cat([torch.eye(3, dtype=torch.float64), rand(LIGHTS - 3, 3) * 1.6 - 0.3])
+    obs = Observations(
+        images=images,
+        s=rand(PIXELS, channels, LIGHTS) * 0.3,
+        weight=5.0 + rand(PIXELS, channels, LIGHTS),
+        clipped=(rand(PIXELS, channels, LIGHTS) < 0.3) & clipped,
+        alpha=alpha,
+        normal_map=torch.linalg.inv(basis),
+        view=view / view.norm(),
+        cosine=0.5 + 0.5 * rand(3),
+        lights_known=lights_known,
+        n_d=n_d,
+        s_unknown=s_unknown,
+    )
+    priors = Priors(
+        shape=7.0,
+        parallel=1.0 + rand(PIXELS),
+        ratio=1.0 + rand(PIXELS),
+        ratio_weight=2.0 + rand(PIXELS),
+        lobe=rand(PIXELS, 3),
+        lobe_weight=3.0 + rand(PIXELS),
+        s_weight=4.0 + rand(PIXELS),
+    )
+    d = rand(PIXELS, channels, 3) * 1.2 - 0.4
+    local = Locals(d, rand(PIXELS) * 2.0, rand(PIXELS, channels, 3) * 0.3 if s_unknown else None).pack()
+    shared = torch.tensor([-0.2, -0.3, -0.25, 1.1, 0.3, 0.4, 0.5, -0.1], dtype=torch.float64)
+    return obs, priors, local, shared
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        {},
+        {"channels": 3},
+        {"channels": 3, "s_unknown": True},
+        {"s_unknown": True, "n_d": None},
+        {"channels": 3, "n_d": 0.8, "clipped": True},
+        {"lights_known": False, "n_d": None, "channels": 3},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("softness", [0.0, 0.4])
+@pytest.mark.parametrize("root_haze", [0.0, 0.5])
+def test_closed_form_is_the_derivative(case, softness, root_haze):
+    obs, priors, local, shared = random_case(**case)
+    shared[SHARED_NAMES.index("softness")] = softness
+    shared[SHARED_NAMES.index("root_haze")] = root_haze
+    problem = build_problem(obs, priors, robust=5.0)
+    r, J, K = forward_jacobian(problem.residual, local, shared, problem.data)
+    own = problem.linearise(local, shared)
+    alone = problem.linearise_local(local, shared)
+    for mine, reference in zip((*own, *alone), (r, J, K, r, J), strict=True):
+        torch.testing.assert_close(mine, reference, rtol=1e-9, atol=1e-9)
+    # Every unknown is felt by the pictures, or the comparison would be of zeros.
+    assert (J[:, : obs.images[0].numel()].abs().amax((0, 1)) > 0).all()
+
+
+def test_the_fit_uses_the_closed_form():
+    obs, priors, local, shared = random_case()
+    problem = build_problem(obs, priors, robust=None)
+
+    def forbidden(*_):
+        raise AssertionError("forward mode was used")
+
+    fast = replace(problem, residual=forbidden)
+    assert fast.linearise(local, shared)[1].shape == (PIXELS, problem.residuals(local, shared).shape[1], 4)
