@@ -102,6 +102,8 @@ class Priors:
     height_sd: float = 0.03
     """Standard deviation of the logarithm of the excess. Rough surfaces are no cosine lobes, and thousands of pixels
     that agree on a wrong shape outvote any soft bound on it: the three bounds of the lobe are firm."""
+    exponent_sd: float = 0.001
+    """The same of log n_s beyond `LEAST_LOG_N_S` and `MOST_LOG_N_S`."""
     softness_sd: float = 0.3
     haze_sd: float = 0.3
     """Standard deviation of sqrt(haze)."""
@@ -232,8 +234,8 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             *((C_1 / mean - 1.0) / priors.common_sd),
             (shared[LOG_C_2] - log_C_1 - torch.log(shared.new_tensor(2.0))) / priors.mirror_sd,
             excess.clamp_min(0.0) / priors.height_sd,
-            (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.height_sd,
-            (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.height_sd,
+            (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.exponent_sd,
+            (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.exponent_sd,
             shared[SOFTNESS] / priors.softness_sd,
             shared[ROOT_HAZE] / priors.haze_sd,
         ]
