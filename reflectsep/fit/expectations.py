@@ -25,6 +25,10 @@ SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.02, 0.015, 0.01
 PARALLEL_SD_MOST = 0.06
 """Beyond this scatter the direction of s says nothing of that of d."""
 RATIO_SIGMA_PX = 3.0
+RATIO_ROUNDS = 4
+"""Smoothings, each with less say for what the last one did not explain."""
+RATIO_BREAK = 4.0
+"""From about this many standard deviations off its neighbourhood on a pixel is of another material."""
 HEIGHT_FACTOR = 2.0
 """Peak of the lobe that is believed, over the largest value above the robust body, which takes some of it."""
 VISIBLE = 3.0
@@ -101,19 +105,49 @@ def parallel_weight(obs: Observations, spread: float, sigma: float) -> Float[Ten
 
 
 def with_ratio(
-    priors: Priors, obs: Observations, whole: Float[Tensor, "pixels channels 3"], mask: Bool[Tensor, "height width"]
+    priors: Priors,
+    obs: Observations,
+    whole: Float[Tensor, "pixels channels 3"],
+    body: Float[Tensor, "pixels channels 3"],
+    mask: Bool[Tensor, "height width"],
 ) -> Priors:
-    """`priors` with the ratio row from the present whole diffuse root and its neighbourhood."""
+    """`priors` with the ratio row from the present whole diffuse root and its neighbourhood.
+
+    A label on a translucent body has another ratio, and its neighbours have no say in it. Borders are found on the
+    robust body: in the present fit, patches in a wrong minimum would pass for another material and never be mended.
+    """
     s = obs.s_basis
     power = s.square().sum(-1).mean(-1)
-    ratio = ((whole * s).sum(-1) / s.square().sum(-1).clamp_min(1e-9)).mean(-1)
-    calm = smooth(ratio[:, None], power, mask, RATIO_SIGMA_PX)[:, 0]
     bright = power > 0.01 * power.max()
     if not bool(bright.any()):
         return priors
-    spread = MAD_TO_SD * float((ratio - calm)[bright].abs().median())
-    weight = torch.where(bright, 1.0 / max(spread, RATIO_SD_LEAST), 0.0)
+    alike = one_material(ratio_to(body, s), power, bright, mask)
+    ratio = ratio_to(whole, s)
+    calm = smooth(ratio[:, None], alike * power, mask, RATIO_SIGMA_PX)[:, 0]
+    counts = bright & (alike > 0.5)
+    if not bool(counts.any()):
+        return priors
+    spread = MAD_TO_SD * float((ratio - calm)[counts].abs().median())
+    weight = torch.where(counts, 1.0 / max(spread, RATIO_SD_LEAST), 0.0)
     return replace(priors, ratio=calm, ratio_weight=weight.to(ratio.dtype))
+
+
+def ratio_to(whole: Float[Tensor, "pixels channels 3"], s: Float[Tensor, "pixels channels 3"]) -> Tensor:
+    """(d + s) . s / s . s, mean over channels."""
+    return ((whole * s).sum(-1) / s.square().sum(-1).clamp_min(1e-9)).mean(-1)
+
+
+def one_material(
+    ratio: Float[Tensor, "pixels"], power: Tensor, bright: Tensor, mask: Bool[Tensor, "height width"]
+) -> Float[Tensor, "pixels"]:
+    """1 where a ratio is that of its neighbourhood, 0 where it is another material's, in between where unsure."""
+    trust = torch.ones_like(ratio)
+    for _ in range(RATIO_ROUNDS):
+        calm = smooth(ratio[:, None], trust * power, mask, RATIO_SIGMA_PX)[:, 0]
+        off = (ratio - calm).abs()
+        spread = max(MAD_TO_SD * float(off[bright].median()), RATIO_SD_LEAST)
+        trust = (1.0 + (off / (RATIO_BREAK * spread)).square()).square().reciprocal()
+    return trust
 
 
 def shape_spread(

@@ -265,7 +265,7 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
         for i in range(2):
             x = unpack(state.found.local, state.obs.channels)
             whole = x.d + (state.obs.s_basis if x.s is None else x.s)
-            priors = with_ratio(state.priors, state.obs, whole, state.mask)
+            priors = with_ratio(state.priors, state.obs, whole, state.body, state.mask)
             state = rescored(replace(state, priors=priors))
             state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1}", progress)
     return smooth_lobes(rescored(hand_on(state, 1)), options, progress)

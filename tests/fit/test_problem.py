@@ -176,11 +176,28 @@ def test_parallel_is_believed_as_far_as_it_holds(small_case):
 def test_the_ratio_row_holds_the_neighbourhoods_ratio(small_case):
     obs, mask, *_ = at_truth(small_case)
     none = no_priors(len(obs), obs.images)
-    priors = with_ratio(none, obs, 2.5 * obs.s_basis, mask)
+    priors = with_ratio(none, obs, 2.5 * obs.s_basis, 2.0 * obs.s_basis, mask)
     torch.testing.assert_close(priors.ratio, torch.full((len(obs),), 2.5, dtype=torch.float64), rtol=1e-5, atol=1e-5)
     assert float(priors.ratio_weight.max()) == pytest.approx(100.0)
     dark = replace(obs, s=torch.zeros_like(obs.s))
-    assert torch.equal(with_ratio(none, dark, obs.s_basis, mask).ratio_weight, none.ratio_weight)
+    assert torch.equal(with_ratio(none, dark, obs.s_basis, obs.s_basis, mask).ratio_weight, none.ratio_weight)
+
+
+def test_a_label_has_no_say_in_the_bodys_ratio_nor_the_body_in_its(small_case):
+    obs, mask, *_ = at_truth(small_case)
+    none = no_priors(len(obs), obs.images)
+    rows, columns = mask.nonzero().T
+    label = ((rows >= 10) & (rows < 13) & (columns >= 8) & (columns < 16))[:, None, None]
+    body = torch.where(label, 6.0, 2.0) * obs.s_basis
+    priors = with_ratio(none, obs, torch.where(label, 6.5, 2.5) * obs.s_basis, body, mask)
+    label = label[:, 0, 0]
+    assert (priors.ratio_weight[label] == 0).all()
+    outside = priors.ratio_weight > 0
+    assert int(outside.sum()) > 0.6 * int((~label).sum())
+    assert float((priors.ratio[outside] - 2.5).abs().max()) < 0.05
+    # A patch that only the present fit sets apart, as one in a wrong minimum, is still held to its neighbours.
+    wrong = with_ratio(none, obs, torch.where(label[:, None, None], 6.5, 2.5) * obs.s_basis, 2.0 * obs.s_basis, mask)
+    assert (wrong.ratio_weight[label] > 0).any()
 
 
 def test_the_shapes_spread_is_measured_on_seen_lobes(small_case):
