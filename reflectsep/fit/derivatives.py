@@ -29,6 +29,7 @@ from reflectsep.fit.problem import (
     Priors,
     normalised_lobe,
     pixel_residual,
+    s_of_lights,
     unpack,
     unpack_globals,
 )
@@ -106,7 +107,7 @@ def jacobians(
     x = unpack(local, obs.channels)
     g = unpack_globals(shared, obs.n_d)
     pixels, channels, lights = obs.images.shape
-    root = x.d @ obs.alpha.mT + (obs.s if x.s is None else x.s @ obs.alpha.mT)
+    root = x.d @ obs.alpha.mT + s_of_lights(x, obs)
     body = body_slopes(root, edge_width(obs.s_basis, shared[SOFTNESS]), g.n_d)
     shine = lobe_slopes(lobe_argument(x.d, x.B, g.a, obs.alpha), g)
     # A clipped value that the model exceeds costs nothing, so it pulls nowhere: its residual is exactly 0.

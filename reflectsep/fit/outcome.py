@@ -12,6 +12,7 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     SHARED_NAMES,
     pixel_residual,
+    s_of_lights,
     unpack,
     unpack_globals,
 )
@@ -44,7 +45,6 @@ def describe(
     misfit = picture_residual(state)
     B, B_sd = x.B, x.B * sd.log_B
     picture = lambda values: to_picture(values, mask)  # noqa: E731
-    s = obs.s if x.s is None else x.s @ obs.alpha.mT
     return Fit(
         a=g.a.float(),
         n_s=g.n_s.float(),
@@ -54,7 +54,7 @@ def describe(
         global_names=tuple(n for n, free in zip(SHARED_NAMES, state.free.tolist(), strict=True) if free),
         covariance=covariance[state.free][:, state.free],
         d=picture(x.d),
-        s=picture(s),
+        s=picture(s_of_lights(x, obs)),
         B=picture(B[:, None, None].expand(-1, obs.channels, 1))[0],
         d_sd=picture(sd.d),
         B_sd=picture(B_sd[:, None, None].expand(-1, obs.channels, 1))[0],

@@ -50,6 +50,12 @@ class Observations:
     lights_known: bool
     n_d: float | None
     """The diffuse exponent; None where it is fitted."""
+    n_d_swept: float = 1.0
+    """The same by the sweeps: where its fit starts."""
+    n_d_sd: float = 0.05
+    """Standard deviation of log `n_d_swept`."""
+    swept: tuple[bool, ...] = ()
+    """Of every light: its s was measured, not mixed; empty: only those of the basis."""
     s_unknown: bool = False
     """The scattering roots of the basis lights are local unknowns too."""
 
@@ -104,6 +110,9 @@ class Priors:
     that agree on a wrong shape outvote any soft bound on it: the three bounds of the lobe are firm."""
     exponent_sd: float = 0.001
     """The same of log n_s beyond `LEAST_LOG_N_S` and `MOST_LOG_N_S`."""
+    log_n_d: float = 0.0
+    n_d_sd: float = 0.05
+    """n_d by the sweeps, and the standard deviation of its logarithm."""
     softness_sd: float = 0.3
     haze_sd: float = 0.3
     """Standard deviation of sqrt(haze)."""
@@ -191,18 +200,22 @@ def normalised_lobe(x: Locals, shared: Tensor) -> Float[Tensor, "pixels 3"]:
     return x.B[:, None] * x.d.mean(-2) / shared[LOG_C_2].exp()
 
 
+def s_of_lights(x: Locals, obs: Observations) -> Float[Tensor, "pixels channels lights"]:
+    """Scattering roots of every light: as measured, moved by the mix of what the fit changed of the basis."""
+    return obs.s if x.s is None else obs.s + (x.s - obs.s_basis) @ obs.alpha.mT
+
+
 def pixel_residual(
     local: Tensor, shared: Tensor, obs: Observations, priors: Priors
 ) -> Float[Tensor, "pixels residuals"]:
     """Residuals of every pixel, pictures first, then the priors' rows."""
     x = unpack(local, obs.channels)
     s = obs.s_basis if x.s is None else x.s
-    s_all = obs.s if x.s is None else x.s @ obs.alpha.mT
     model = reflectance(
         x.d,
         x.B,
         unpack_globals(shared, obs.n_d),
-        s=s_all,
+        s=s_of_lights(x, obs),
         alpha=obs.alpha,
         width=edge_width(obs.s_basis, shared[SOFTNESS]),
     )
@@ -236,6 +249,7 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             excess.clamp_min(0.0) / priors.height_sd,
             (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.exponent_sd,
             (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.exponent_sd,
+            (shared[LOG_N_D] - priors.log_n_d) / priors.n_d_sd,
             shared[SOFTNESS] / priors.softness_sd,
             shared[ROOT_HAZE] / priors.haze_sd,
         ]

@@ -58,6 +58,8 @@ from reflectsep.solve.local import Termination
 HUBER = 5.0
 """Residuals beyond this many standard deviations are cast shadows or inter-reflections, not noise."""
 MIN_PICTURES = {"measured": 6, "none": 6, "unknown": 8}
+N_D_SD, N_D_SD_LEAST = 0.05, 0.01
+"""Relative standard deviation of n_d: of 1 where no sweep tells, and the least that a sweep's is taken to have."""
 EXTENSION_GAIN = 0.01
 """Soft shadows and the haze stay only where they lower the whole cost by this share."""
 
@@ -130,6 +132,9 @@ def observe(
         cosine=basis @ view if known else torch.ones(3, dtype=dtype),
         lights_known=known,
         n_d=None if options.refine_n_d else n_d,
+        n_d_swept=n_d,
+        n_d_sd=max(scattering.n_d_sd / n_d, N_D_SD_LEAST) if use and scattering is not None else N_D_SD,
+        swept=scattering.measured if use and scattering is not None else (),
         s_unknown=options.scattering == "unknown" or (use and options.scattering_sd > 0),
     )
     return obs, mask, intensity
@@ -137,7 +142,7 @@ def observe(
 
 def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitOptions) -> State:
     """Noise, robust body, scattering beyond the shadow's edge, first priors."""
-    n_d = 1.0 if obs.n_d is None else obs.n_d
+    n_d = obs.n_d_swept
     scale = near_maximum(obs.images.amax((1, 2)))
     if not scale > 0:
         raise FitError(f"the brightest picture values inside the mask are {scale:.3g}: nothing to fit")
@@ -150,13 +155,14 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     mixed = extended @ obs.alpha.mT
     linear = obs.s_basis @ obs.alpha.mT
     # Lights with a sweep of their own keep what was measured, moved with the extension beyond the shadow's edge.
-    own = (measured - linear).abs().amax((0, 1)) > 1e-9
+    own = torch.tensor(obs.swept or [False] * len(obs.alpha))
     s = torch.where(own, measured.minimum(measured + mixed - linear), mixed)
     s[..., :3] = extended
     obs = replace(obs, s=s, weight=weights(obs, options, sigma))
-    priors = first_priors(obs, body, sigma)
+    priors = replace(first_priors(obs, body, sigma), log_n_d=math.log(n_d), n_d_sd=obs.n_d_sd)
     if options.prior == "none":
-        priors = replace(no_priors(len(obs), obs.images), height=priors.height)
+        bare = no_priors(len(obs), obs.images)
+        priors = replace(bare, height=priors.height, log_n_d=priors.log_n_d, n_d_sd=priors.n_d_sd)
     if options.scattering == "measured" and obs.s_unknown:
         priors = replace(priors, s_weight=scattering_weight(obs, options, sigma))
     elif obs.s_unknown:

@@ -140,7 +140,7 @@ def informative_pixels(
 
     Every second of the most telling 2 x count, so that not only the cores of a few highlights speak.
     """
-    n_d = 1.0 if obs.n_d is None else obs.n_d
+    n_d = obs.n_d_swept
     above = (obs.images - diffuse(body @ obs.alpha.mT, body.new_zeros(()), n_d)).mean(1) * obs.weight.mean(1)
     score = above.clamp_min(0.0).clamp_max(50.0).square().sum(-1)
     order = score.argsort(descending=True)

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from reflectsep.errors import FitError
+from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
+from reflectsep.fit.problem import LOG_N_D, Locals, s_of_lights
 from reflectsep.fit.reflectance import fit_reflectance, observe, prepare
 from reflectsep.flags import Flag
 
@@ -129,12 +131,7 @@ def test_a_fixed_exponent_stays_fixed(paper_case):
     ("paper", "options"),
     [
         pytest.param({"lights": 8}, FitOptions(scattering="unknown", max_iterations=6), id="unknown scattering"),
-        pytest.param(
-            {},
-            FitOptions(refine_n_d=True, max_iterations=6),
-            id="refined n_d",
-            marks=pytest.mark.xfail(reason="n_d has no prior and runs away from where the sweeps put it"),
-        ),
+        pytest.param({}, FitOptions(refine_n_d=True, max_iterations=6), id="refined n_d"),
         pytest.param({"channels": 3}, FitOptions(max_iterations=6), id="colour"),
         pytest.param({}, FitOptions(dtype="float32", max_iterations=6), id="single precision"),
     ],
@@ -166,3 +163,39 @@ def test_clipped_highlights_enter_as_lower_bounds(paper_case):
     fit = fit_reflectance(clipped, case.scattering, QUICK)
     assert_sound(fit, case)
     assert case.psnr(fit) > case.psnr(fit_reflectance(believed, case.scattering, QUICK))
+
+
+def test_a_light_with_its_own_sweep_keeps_what_was_measured(paper_case):
+    case = paper_case(size=16)
+    lights = len(case.stack.names)
+    root = case.scattering.root.clone()
+    root[3] *= 0.9
+    options = FitOptions(scattering_sd=0.0)
+    for swept in (False, True):
+        measured = (True, True, True, swept, *[False] * (lights - 4))
+        scattering = replace(case.scattering, root=root, measured=measured)
+        obs, mask, _ = observe(case.stack, scattering, options, torch.float64)
+        state = prepare(obs, mask, options)
+        mixed = state.obs.s_basis @ state.obs.alpha.mT
+        lit = (case.truth.d[:, 0, mask] > 0.05).all(0)  # no shadow's edge, beyond which s is extended
+        ratio = (state.obs.s[:, 0, 3] / mixed[:, 0, 3])[lit]
+        assert float((ratio - (0.9 if swept else 1.0)).abs().max()) < 1e-6
+        # Where s is refined, by a shift of the basis, that light moves along and keeps its own difference.
+        free = replace(state.obs, s_unknown=True)
+        x = Locals(free.images[..., :3], free.images[:, 0, 0], 1.02 * free.s_basis)
+        torch.testing.assert_close(s_of_lights(x, free), free.s + 0.02 * mixed)
+
+
+def test_refining_n_d_starts_from_the_sweeps_and_is_held_to_them(paper_case):
+    case = paper_case(size=16)
+    scattering = replace(case.scattering, n_d=0.9, n_d_sd=0.02)
+    options = FitOptions(refine_n_d=True)
+    obs, mask, _ = observe(case.stack, scattering, options, torch.float64)
+    state = prepare(obs, mask, options)
+    assert float(state.shared[LOG_N_D].exp()) == pytest.approx(0.9)
+    row = build_problem(state.obs, state.priors, robust=None).shared_residual
+    assert row is not None
+    moved = state.shared.clone()
+    moved[LOG_N_D] += 0.05
+    # 0.05 off is 0.05 / (0.02 / 0.9) = 2.25 standard deviations.
+    assert float((row(moved) - row(state.shared)).abs().max()) == pytest.approx(2.25)
