@@ -145,7 +145,7 @@ class FitSettings:
         1e-6, "relative change of the cost that ends a pixel's iterations", above=0.0, at_most=1.0
     )
     globals_pixels: int = setting(300, "pixels that start the globals", at_least=8)
-    chunk: int = setting(32768, "pixels handled at once; bounds the memory", at_least=1)
+    chunk: int = setting(4096, "pixels handled at once; bounds the memory", at_least=1)
     prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reflectsep.fit.blocks import build_problem
@@ -29,6 +29,11 @@ from reflectsep.solve.local import Termination
 
 Report = Callable[[int, int], None]
 
+SAME_LOBE = 0.02
+"""Lobes that differ by less, relatively, are one start."""
+UNSEEN = 0.1
+"""Highlights below this many standard deviations of the noise do not lead a pixel anywhere."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Effort:
@@ -46,7 +51,7 @@ class Effort:
     """Pixels that vote at most: the globals of more are known no better, and the others follow them."""
     rounds: int = 4
     starts: int = 3
-    chunk: int = 1 << 15
+    chunk: int = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -207,7 +212,12 @@ def offer_lobes(
     robust: float | None,
 ) -> LocalFit:
     """Every pixel from the start whose lobe B d is `lobe_vector`, where that ends cheaper than what was found."""
-    x = unpack(found.local, obs.channels)
+    which = worth_trying(obs, found.local, shared, lobe_vector)
+    if len(which) == 0:
+        return found
+    everywhere, lobe_vector = len(obs), lobe_vector[which]
+    obs, priors = obs.take(which), priors.take(which)
+    x = unpack(found.local[which], obs.channels)
     globals_ = unpack_globals(shared, obs.n_d)
     shine = lobe(globals_.a + lobe_vector, globals_.n_s, globals_.haze)
     s = obs.s_basis if x.s is None else x.s
@@ -220,8 +230,18 @@ def offer_lobes(
     start = Locals(d, log_B, x.s).pack()
     problem = build_problem(obs, priors, robust=robust)
     tried = local_in_chunks(problem, start, shared, effort.polish, effort.chunk)
-    which = torch.arange(len(obs))
-    return merge(found, which, tried.local, tried.cost, tried.converged, len(obs))
+    return merge(found, which, tried.local, tried.cost, tried.converged, everywhere)
+
+
+def worth_trying(
+    obs: Observations, local: Tensor, shared: Float[Tensor, "8"], lobe_vector: Float[Tensor, "pixels 3"]
+) -> Int[Tensor, "some"]:
+    """Pixels that another lobe could lead elsewhere: not where it is the present one, nor where neither is seen."""
+    x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
+    own = x.B[:, None] * x.d.mean(1)
+    same = (lobe_vector - own).norm(dim=-1) <= SAME_LOBE * own.norm(dim=-1)
+    visible = lambda v: (lobe((g.a + v) @ obs.alpha.mT, g.n_s, g.haze) * obs.weight.mean(1)).amax(-1) > UNSEEN  # noqa: E731
+    return (~same & (visible(own) | visible(lobe_vector))).nonzero()[:, 0]
 
 
 def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) -> Float[Tensor, "8"]:

@@ -32,7 +32,7 @@ class JointOptions:
     """Stop where the relative decrease of the total cost stays below this twice in a row."""
     inner: Termination = field(default_factory=lambda: Termination(max_iterations=6))
     """Local iterations after every shared step."""
-    chunk: int = 1 << 16
+    chunk: int = 1 << 12
     damping: float = 1e-4
 
 

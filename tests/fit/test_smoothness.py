@@ -11,7 +11,8 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import LOG_C_2, LOG_N_S, Locals, no_priors, normalised_lobe, unpack
 from reflectsep.fit.reflectance import observe, prepare, with_noise
 from reflectsep.fit.smoothness import SCALES_PX, lobe_variance, predict, scales_of, with_lobe
-from reflectsep.fit.solution import LocalFit, offer_lobes
+from reflectsep.fit.solution import LocalFit, worth_trying
+from reflectsep.solve.local import solve_local
 
 EXACT = FitOptions(scattering_sd=0.0)
 
@@ -99,6 +100,21 @@ def test_the_row_weighs_by_spread_and_variance_and_never_carries_nan(at_truth):
     torch.testing.assert_close(rows[:, -3:], priors.lobe_weight[:, None] * off)
 
 
+def test_only_another_and_visible_lobe_is_tried(at_truth):
+    state, lobe = at_truth
+    own = lobe * state.shared[LOG_C_2].exp()
+    faint = torch.zeros(len(own), dtype=torch.bool)
+    faint[::2] = True
+    local = state.found.local.clone()
+    local[faint, 3] -= 4.0  # u < 0 under every light
+    own = torch.where(faint[:, None], own * torch.tensor(-4.0).exp(), own)
+    tried = lambda factor: worth_trying(state.obs, local, state.shared, factor * own)  # noqa: E731
+    assert len(tried(1.01)) == 0
+    assert torch.equal(tried(1.2), (~faint).nonzero()[:, 0])
+    # Out of the dark: unseen as yet, but not as the neighbours have it.
+    assert len(tried(torch.where(faint, 66.0, 1.0)[:, None])) == int(faint.sum())
+
+
 def test_the_variance_of_a_lobe_is_that_of_repeated_noise(at_truth):
     state, lobe = at_truth
     own = lobe_variance(state)
@@ -111,17 +127,9 @@ def test_the_variance_of_a_lobe_is_that_of_repeated_noise(at_truth):
         rows = problem.residuals(state.found.local, state.shared)[:, : clean[0].numel()]
         clean = state.obs.images + rows.view_as(clean) / state.obs.weight
         obs = replace(state.obs, images=clean + noise)
-        moved = offer_lobes(
-            obs,
-            state.priors,
-            state.found if squares else replace(state.found, cost=torch.full_like(state.found.cost, torch.inf)),
-            state.shared,
-            lobe * state.shared[LOG_C_2].exp(),
-            state.effort,
-            None,
-        )
+        again = build_problem(obs, state.priors, robust=None)
+        moved = solve_local(again, state.found.local, state.shared)
         squares.append((normalised_lobe(unpack(moved.local, obs.channels), state.shared) - lobe).square().mean(-1))
-        state = replace(state, found=replace(state.found, cost=torch.full_like(state.found.cost, torch.inf)))
     measured = torch.stack(squares).mean(0).median()
     # Weights of Eq. 22 and priors make the stated figure an approximation.
     assert 0.3 < float(measured / own.median()) < 3.0
