@@ -8,6 +8,7 @@ import re
 import pytest
 import torch
 
+from reflectsep.config import FitSettings
 from reflectsep.data import Frame, PhotometricStack, Sweep
 from reflectsep.errors import SweepError
 from reflectsep.flags import Flag
@@ -145,7 +146,10 @@ def test_the_command_names_what_is_not_the_default(exact):
     document = {
         "capture": "/data/my wax",
         "heldout": ["L7"],
-        "settings": {"fit": {"lobe": "haze", "chunk": 32768, "n_s": None}, "scatter": {"distance_px": 2.0}},
+        "settings": {
+            "fit": {"lobe": "haze", "chunk": FitSettings().chunk, "n_s": None},
+            "scatter": {"distance_px": 2.0},
+        },
     }
     said = command(dataclasses.replace(separation, document=document), "out")
     assert said == (
