@@ -23,7 +23,7 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         return jacobians(local, shared, *regroup(data, obs, priors), with_shared=with_shared)
 
-    prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1 + 3
+    prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1 + 3 + 3
     threshold = None
     if robust is not None:
         picture = obs.images.new_full((obs.images[0].numel(),), robust)
@@ -41,6 +41,8 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
             priors.ratio_weight,
             priors.lobe,
             priors.lobe_weight,
+            priors.facing,
+            priors.facing_weight,
             priors.s_weight,
         ),
         threshold=threshold,
@@ -50,7 +52,7 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
 
 def regroup(data: tuple[Tensor, ...], obs: Observations, priors: Priors) -> tuple[Observations, Priors]:
     """The solver's per-block tensors, back in their named places."""
-    images, s, weight, clipped, parallel, ratio, ratio_weight, lobe, lobe_weight, s_weight = data
+    images, s, weight, clipped, parallel, ratio, ratio_weight, lobe, lobe_weight, facing, facing_weight, s_weight = data
     return (
         replace(obs, images=images, s=s, weight=weight, clipped=clipped),
         replace(
@@ -60,6 +62,8 @@ def regroup(data: tuple[Tensor, ...], obs: Observations, priors: Priors) -> tupl
             ratio_weight=ratio_weight,
             lobe=lobe,
             lobe_weight=lobe_weight,
+            facing=facing,
+            facing_weight=facing_weight,
             s_weight=s_weight,
         ),
     )

@@ -27,6 +27,7 @@ from reflectsep.fit.problem import (
     Locals,
     Observations,
     Priors,
+    across,
     normalised_lobe,
     pixel_residual,
     s_of_lights,
@@ -129,7 +130,9 @@ def jacobians(
     first = channels * lights
     K[:, first, LOG_C_2] = -priors.shape
     lobe = first + 2 + 3 * channels
-    K[:, lobe : lobe + 3, LOG_C_2] = -priors.lobe_weight[:, None] * normalised_lobe(x, shared)
+    v = normalised_lobe(x, shared)
+    K[:, lobe : lobe + 3, LOG_C_2] = -priors.lobe_weight[:, None] * v
+    K[:, lobe + 3 : lobe + 6, LOG_C_2] = -priors.facing_weight[:, None] * across(v, priors.facing)
     return r, torch.cat(rows, 1), K
 
 
@@ -160,7 +163,7 @@ def prior_columns(
     pixels, channels, _ = x.d.shape
     three, log_B = 3 * channels, 3 * channels
     own = 0 if x.s is None else three
-    J = x.d.new_zeros(pixels, 1 + three + 1 + 3 + own, P)
+    J = x.d.new_zeros(pixels, 1 + three + 1 + 3 + 3 + own, P)
     mean = x.d.mean(1)
     J[:, 0, :three] = (priors.shape / channels * shape_slope(mean, obs)).repeat(1, channels)
     J[:, 0, log_B] = priors.shape
@@ -185,10 +188,15 @@ def prior_columns(
 
     lobe = 2 + three
     strength = priors.lobe_weight[:, None]
-    J[:, lobe : lobe + 3, log_B] = strength * normalised_lobe(x, shared)
-    share = strength[:, 0] * x.B / shared[LOG_C_2].exp() / channels
+    v, share = normalised_lobe(x, shared), x.B / shared[LOG_C_2].exp() / channels
+    J[:, lobe : lobe + 3, log_B] = strength * v
     for k in range(3):
-        J[:, lobe + k, k:three:3] = share[:, None]
+        J[:, lobe + k, k:three:3] = strength * share[:, None]
+    facing = lobe + 3
+    strength = priors.facing_weight[:, None]
+    J[:, facing : facing + 3, log_B] = strength * across(v, priors.facing)
+    off = eye - priors.facing[:, :, None] * priors.facing[:, None, :]
+    J[:, facing : facing + 3, :three] = ((strength * share[:, None])[..., None] * off).repeat(1, 1, channels)
     if own:
-        J[:, lobe + 3 :, three + 1 :] = torch.diag_embed(priors.s_weight[:, None].expand(-1, three))
+        J[:, facing + 3 :, three + 1 :] = torch.diag_embed(priors.s_weight[:, None].expand(-1, three))
     return J

@@ -14,7 +14,17 @@ from torch import Tensor
 
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.neighbours import MAD_TO_SD, smooth
-from reflectsep.fit.problem import Observations, Priors, no_priors, shape_row, unpack
+from reflectsep.fit.problem import (
+    Locals,
+    Observations,
+    Priors,
+    across,
+    log_shape,
+    no_priors,
+    normalised_lobe,
+    shape_row,
+    unpack,
+)
 from reflectsep.solve.joint import inverse
 from reflectsep.solve.local import normal_equations
 
@@ -31,6 +41,14 @@ RATIO_BREAK = 4.0
 """From about this many standard deviations off its neighbourhood on a pixel is of another material."""
 HEIGHT_FACTOR = 2.0
 """Peak of the lobe that is believed, over the largest value above the robust body, which takes some of it."""
+FACING_SD, FACING_SD_LEAST = 0.1, 0.03
+"""Scatter of the direction of d about that of d + s, in radians: at most, where it cannot be learnt, and at least."""
+FACING_SIGMA_PX = 3.0
+"""Over such a distance scattering mixes normals: where they turn within it, d + s says less of d."""
+RAYLEIGH = 1.18
+"""Median of a Rayleigh variable in standard deviations."""
+LEAST_SEEN = 30
+"""Pixels with a clear lobe that it takes to learn a scatter."""
 VISIBLE = 3.0
 """A lobe counts as seen where it exceeds this many standard deviations of the noise."""
 
@@ -93,7 +111,7 @@ def parallel_spread(obs: Observations, body: Float[Tensor, "pixels channels 3"])
     off = (body - along * s).square().sum(-1).sqrt().mean(-1)
     size = size[..., 0].mean(-1)
     lit = size > 0.1 * size.max()
-    return float((off[lit] / size[lit]).median()) / 1.18  # median of a Rayleigh variable in standard deviations
+    return float((off[lit] / size[lit]).median()) / RAYLEIGH
 
 
 def parallel_weight(obs: Observations, spread: float, sigma: float) -> Float[Tensor, "pixels"]:
@@ -150,6 +168,38 @@ def one_material(
     return trust
 
 
+def with_facing(
+    priors: Priors,
+    obs: Observations,
+    x: Locals,
+    shared: Tensor,
+    shine: Float[Tensor, "pixels lights"],
+    sigma: float,
+    mask: Bool[Tensor, "height width"],
+) -> Priors:
+    """`priors` with the facing row from the present whole diffuse root; as firm as where the lobe is well seen.
+
+    Where scattering is nearly all of a pixel's light, d = whole - s has the direction of its error, and a lobe that no
+    picture of the basis sees shines in the pictures of other lights.
+    """
+    whole = (x.d + (obs.s_basis if x.s is None else x.s)).mean(1)
+    size = whole.norm(dim=-1).clamp_min(1e-9)
+    facing = whole / size[:, None]
+    v = normalised_lobe(x, shared)
+    seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
+    spread = FACING_SD
+    if int(seen.sum()) >= LEAST_SEEN:
+        off = across(v, facing).norm(dim=-1) / v.norm(dim=-1).clamp_min(1e-9)
+        spread = min(max(float(off[seen].median()) / RAYLEIGH, FACING_SD_LEAST), FACING_SD)
+    # The length of the lobe by its geometry, from the same normal.
+    length = size * (-log_shape(whole, obs.normal_map, obs.view, obs.lights_known)).exp()
+    calm = torch.nn.functional.normalize(smooth(facing, size, mask, FACING_SIGMA_PX), dim=-1)
+    bent = (facing - calm).square().sum(-1) / 2.0
+    weight = 1.0 / (length * (spread**2 + bent + (sigma / size).square()).sqrt()).clamp_min(1e-3)
+    lit = whole.mean(-1) > 2.0 * sigma
+    return replace(priors, facing=facing, facing_weight=torch.where(lit, weight, 0.0))
+
+
 def shape_spread(
     obs: Observations, local: Tensor, shared: Tensor, shine: Float[Tensor, "pixels lights"], sigma: float
 ) -> float:
@@ -159,7 +209,7 @@ def shape_spread(
     # Well seen: in two pictures or more, and well above the noise.
     seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
     first = SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD
-    if int(seen.sum()) < 30:
+    if int(seen.sum()) < LEAST_SEEN:
         return first
     values = row[seen]
     spread = MAD_TO_SD * float((values - values.median()).abs().median())

@@ -9,6 +9,7 @@ Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel
     parallel  (d + s) off the direction of s, relative to |s|         whole and scattered light see one irradiance
     ratio     (d + s) / s against its neighbourhood                   how much scatters changes slowly over a surface
     lobe      B d / C_2 against its neighbourhood                     the surface's shape is smooth, whatever its albedo
+    facing    B d / C_2 off the direction of d + s                    scattering blurs the normal, but not by much
     measured  (s - measured s) / its standard deviation               where s is unknown too
 """
 
@@ -97,6 +98,10 @@ class Priors:
     """B d / C_2 = (N.V)(N.L_k) as the neighbours have it."""
     lobe_weight: Float[Tensor, "pixels"]
     """1 / standard deviation of that."""
+    facing: Float[Tensor, "pixels 3"]
+    """Unit vector along d + s, which is that of N.L_k up to what scattering blurs."""
+    facing_weight: Float[Tensor, "pixels"]
+    """1 / standard deviation of the lobe across that direction."""
     s_weight: Float[Tensor, "pixels"]
     """1 / standard deviation of the measured s; only where s is a local unknown."""
     mirror_sd: float = 0.02
@@ -126,6 +131,8 @@ class Priors:
             ratio_weight=self.ratio_weight[index],
             lobe=self.lobe[index],
             lobe_weight=self.lobe_weight[index],
+            facing=self.facing[index],
+            facing_weight=self.facing_weight[index],
             s_weight=self.s_weight[index],
         )
 
@@ -133,8 +140,18 @@ class Priors:
 def no_priors(pixels: int, like: Tensor) -> Priors:
     """Priors whose rows of single pixels are all switched off."""
     zero = like.new_zeros(pixels)
-    lobe = like.new_zeros(pixels, 3)
-    return Priors(shape=0.0, parallel=zero, ratio=zero, ratio_weight=zero, lobe=lobe, lobe_weight=zero, s_weight=zero)
+    vector = like.new_zeros(pixels, 3)
+    return Priors(
+        shape=0.0,
+        parallel=zero,
+        ratio=zero,
+        ratio_weight=zero,
+        lobe=vector,
+        lobe_weight=zero,
+        facing=vector,
+        facing_weight=zero,
+        s_weight=zero,
+    )
 
 
 @dataclass(frozen=True)
@@ -200,6 +217,11 @@ def normalised_lobe(x: Locals, shared: Tensor) -> Float[Tensor, "pixels 3"]:
     return x.B[:, None] * x.d.mean(-2) / shared[LOG_C_2].exp()
 
 
+def across(v: Float[Tensor, "pixels 3"], direction: Float[Tensor, "pixels 3"]) -> Float[Tensor, "pixels 3"]:
+    """The part of v that is not along the unit vector `direction`."""
+    return v - (v * direction).sum(-1, keepdim=True) * direction
+
+
 def s_of_lights(x: Locals, obs: Observations) -> Float[Tensor, "pixels channels lights"]:
     """Scattering roots of every light: as measured, moved by the mix of what the fit changed of the basis."""
     return obs.s if x.s is None else obs.s + (x.s - obs.s_basis) @ obs.alpha.mT
@@ -230,7 +252,9 @@ def pixel_residual(
     along = (whole * s).sum(-1, keepdim=True) / power
     rows.append((priors.parallel[..., None, None] * (whole - along * s)).flatten(-2))
     rows.append(priors.ratio_weight[..., None] * (along[..., 0].mean(-1, keepdim=True) - priors.ratio[..., None]))
-    rows.append(priors.lobe_weight[..., None] * (normalised_lobe(x, shared) - priors.lobe))
+    lobe = normalised_lobe(x, shared)
+    rows.append(priors.lobe_weight[..., None] * (lobe - priors.lobe))
+    rows.append(priors.facing_weight[..., None] * across(lobe, priors.facing))
     if x.s is not None:
         rows.append((priors.s_weight[..., None, None] * (x.s - obs.s_basis)).flatten(-2))
     return torch.cat(rows, -1)

@@ -23,6 +23,7 @@ from reflectsep.fit.expectations import (
     noise_level,
     shape_spread,
     unknowns_in_effect,
+    with_facing,
     with_ratio,
 )
 from reflectsep.fit.options import FitOptions
@@ -272,6 +273,8 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
             x = unpack(state.found.local, state.obs.channels)
             whole = x.d + (state.obs.s_basis if x.s is None else x.s)
             priors = with_ratio(state.priors, state.obs, whole, state.body, state.mask)
+            shine = lobe_pictures(state.obs, state.found.local, state.shared)
+            priors = with_facing(priors, state.obs, x, state.shared, shine, state.sigma, state.mask)
             state = rescored(replace(state, priors=priors))
             state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1}", progress)
     return smooth_lobes(rescored(hand_on(state, 1)), options, progress)

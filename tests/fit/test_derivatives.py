@@ -45,6 +45,8 @@ def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clip
         ratio_weight=2.0 + rand(PIXELS),
         lobe=rand(PIXELS, 3),
         lobe_weight=3.0 + rand(PIXELS),
+        facing=torch.nn.functional.normalize(rand(PIXELS, 3), dim=-1),
+        facing_weight=2.0 + rand(PIXELS),
         s_weight=4.0 + rand(PIXELS),
     )
     d = rand(PIXELS, channels, 3) * 1.2 - 0.4

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,6 +13,7 @@ from reflectsep.fit.expectations import (
     parallel_spread,
     parallel_weight,
     shape_spread,
+    with_facing,
     with_ratio,
 )
 from reflectsep.fit.options import FitOptions
@@ -21,6 +23,7 @@ from reflectsep.fit.problem import (
     Locals,
     log_shape,
     no_priors,
+    normalised_lobe,
     pixel_residual,
     shared_residual,
     unpack,
@@ -198,6 +201,41 @@ def test_a_label_has_no_say_in_the_bodys_ratio_nor_the_body_in_its(small_case):
     # A patch that only the present fit sets apart, as one in a wrong minimum, is still held to its neighbours.
     wrong = with_ratio(none, obs, torch.where(label[:, None, None], 6.5, 2.5) * obs.s_basis, 2.0 * obs.s_basis, mask)
     assert (wrong.ratio_weight[label] > 0).any()
+
+
+def tilted(x, angle):
+    """d of every pixel turned by `angle` within the space of the three lights, of the length it had."""
+    across_it = torch.nn.functional.normalize(torch.linalg.cross(x.d, torch.ones_like(x.d)), dim=-1)
+    return replace(x, d=x.d * math.cos(angle) + across_it * x.d.norm(dim=-1, keepdim=True) * math.sin(angle))
+
+
+def test_a_lobe_is_held_to_the_direction_of_the_whole_light_as_firmly_as_the_seen_ones(small_case):
+    obs, mask, local, shared = at_truth(small_case)
+    none = no_priors(len(obs), obs.images)
+    x, shine = unpack(local, 1), lobe_pictures(obs, local, shared)
+    free = replace(obs, s=torch.zeros_like(obs.s))
+    exact = with_facing(none, free, x, shared, shine, 1e-6, mask)
+    flat = exact.facing_weight > 0
+    torch.testing.assert_close(exact.facing, torch.nn.functional.normalize(x.d[:, 0], dim=-1))
+    # The same light with its scattering turned away from d: nothing else but the learnt scatter differs.
+    turned = tilted(x, 0.08)
+    scattering = torch.cat([x.d - turned.d, obs.s[..., 3:]], -1)
+    loose = with_facing(none, replace(obs, s=scattering), turned, shared, shine, 1e-6, mask)
+    ratio = exact.facing_weight[flat] / loose.facing_weight[flat]
+    assert float(ratio.amax()) < 0.08 / 1.18 / 0.03 * 1.01
+    assert float(ratio.median()) > 1.1
+    unseen = with_facing(none, free, x, shared, 0 * shine, 1e-6, mask)
+    assert bool((unseen.facing_weight[flat] < loose.facing_weight[flat]).all())
+    noisy = with_facing(none, free, x, shared, shine, 0.2 * float(x.d.mean()), mask)
+    assert bool((noisy.facing_weight <= exact.facing_weight).all())
+    dark = with_facing(none, free, replace(x, d=-x.d), shared, shine, 1e-6, mask)
+    assert float(dark.facing_weight.abs().max()) == 0.0
+    # Along the direction the row is nothing, across it the weight times what is across.
+    rows = lambda at: pixel_residual(at.pack(), shared, free, exact)[:, -3:]  # noqa: E731
+    assert float(rows(x).abs().max()) < 1e-9
+    v = normalised_lobe(x, shared)
+    expected = exact.facing_weight * v.norm(dim=-1) * math.sin(0.08)
+    torch.testing.assert_close(rows(tilted(x, 0.08)).norm(dim=-1)[flat], expected[flat])
 
 
 def test_the_shapes_spread_is_measured_on_seen_lobes(small_case):

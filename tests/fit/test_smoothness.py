@@ -97,7 +97,7 @@ def test_the_row_weighs_by_spread_and_variance_and_never_carries_nan(at_truth):
     torch.testing.assert_close(priors.lobe_weight[6:], expected[6:])
     rows = build_problem(state.obs, priors, robust=None).residuals(state.found.local, state.shared)
     off = normalised_lobe(unpack(state.found.local, state.obs.channels), state.shared) - priors.lobe
-    torch.testing.assert_close(rows[:, -3:], priors.lobe_weight[:, None] * off)
+    torch.testing.assert_close(rows[:, -6:-3], priors.lobe_weight[:, None] * off)
 
 
 def test_only_another_and_visible_lobe_is_tried(at_truth):
