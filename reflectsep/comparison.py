@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from reflectsep.data import Capture
 from reflectsep.errors import CaptureError
+from reflectsep.export.harmonics import ptm_terms
 from reflectsep.io.exr import read_channels
 from reflectsep.io.lights import read_lights
 from reflectsep.io.pictures import read_picture
@@ -38,8 +40,10 @@ def compare_result(
     lines = [str(out)]
     for light in relit:
         mask = ours.mask if light.counts is None else ours.mask & light.counts
-        scores = [psnr(picture, light.real, mask) for picture in (light.ours, light.baseline)]
-        lines.append(f"  {light.light:12s} ours {scores[0]:5.1f} dB, Lin & Lee {scores[1]:5.1f} dB")
+        model = {"Lin & Lee": light.baseline}
+        methods = model if baseline is ours else {"ours": light.ours} | model
+        scores = [f"{name} {psnr(p, light.real, mask):5.1f} dB" for name, p in (methods | dict(light.others)).items()]
+        lines.append(f"  {light.light:12s} {', '.join(scores)}")
     return "\n".join([*lines, *truth_lines(ours, baseline, capture)])
 
 
@@ -69,7 +73,8 @@ def left_out(
     mixes = alphas_for([capture.lights[name] for name in names], ours.light_vectors)
     rows = []
     for i, name in enumerate(names):
-        rows.append(held_out(name, pictures[0][i], ours, baseline, mixes[name], counts=~pictures[1][i].any(0)))
+        counts = ~pictures[1][i].any(0)
+        rows.append(held_out(name, pictures[0][i], ours, baseline, mixes[name], counts=counts))
     return rows
 
 
@@ -96,13 +101,38 @@ def held_out(
 ) -> HeldOut:
     """One light's real picture (channels, height, width) and the two models' under it; `counts` (height, width)."""
     alpha = torch.tensor(mix.alpha)
+    plain = without_a_lobe(ours, alpha)
     return HeldOut(
         light=name,
         real=torch.where(counts, real, 0.0),
         ours=bounded(ours.relight(alpha), real),
         baseline=bounded(baseline.relight(alpha), real),
         counts=counts,
+        others={name: bounded(picture, real) for name, picture in plain.items()},
     )
+
+
+def without_a_lobe(ours: Separation, alpha: Float[Tensor, "3"]) -> dict[str, Float[Tensor, "channels height width"]]:
+    """The light of mix `alpha` by least squares over the pictures that the fit saw, without a lobe, by name.
+
+    A polynomial texture map (Malzbender, Gelb and Wolters 2001), and a Lambertian body without shadows; none where the
+    lights are unknown or too few for the polynomial.
+    """
+    if ours.light_vectors is None:
+        return {}
+    vectors = ours.light_vectors.to(ours.d)
+    intensity = vectors.norm(dim=-1, keepdim=True)
+    pictures = (ours.relight(ours.alpha) + ours.residual) / intensity[..., None, None]
+    lights, wanted = vectors / intensity, (alpha.to(vectors) @ vectors[:3])[None]
+    strength = wanted.norm().clamp_min(1e-12)
+    found = {}
+    for name, terms in (("PTM", ptm_terms), ("Lambert", lambda directions: directions)):
+        known = terms(lights)
+        if int(torch.linalg.matrix_rank(known)) == known.shape[1]:
+            mix = terms(wanted / strength) @ torch.linalg.pinv(known) * strength
+            picture = torch.einsum("n,nchw->chw", mix[0], pictures)
+            found[name] = picture.clamp_min(0.0) if name == "Lambert" else picture
+    return found
 
 
 def bounded(picture: Tensor, real: Tensor) -> Tensor:

@@ -317,16 +317,25 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     lights_file = separation.document.get("lights_file")
     capture = load_capture(folder, basis=separation.basis, lights_file=lights_file)
     heldout = [str(name) for name in separation.document.get("heldout", [])]
-    baseline = fit(
+    baseline = lin_lee(separation, capture, job.result, heldout, progress)
+    pictures = held_out_pictures(capture, heldout) if heldout else None
+    return compare_result(separation, baseline, capture, heldout, pictures, Path(job.out))
+
+
+def lin_lee(
+    separation: Separation, capture: Capture, result: str, heldout: Sequence[str], progress: Progress
+) -> Separation:
+    """Lin & Lee's model fitted as `separation` was; a result without scattering is that model already."""
+    if not bool(separation.s.any()):
+        return separation
+    return fit(
         capture,
-        settings=recorded_settings(separation, job.result),
+        settings=recorded_settings(separation, result),
         calibration=recorded_calibration(separation),
         heldout=heldout,
         progress=progress,
         scattering="none",
     )
-    pictures = held_out_pictures(capture, heldout) if heldout else None
-    return compare_result(separation, baseline, capture, heldout, pictures, Path(job.out))
 
 
 def recorded_capture(separation: Separation, result: str) -> Path:
@@ -370,15 +379,7 @@ def run_report(job: ReportJob, progress: Progress = silent) -> str:
         capture = load_capture(named, basis=separation.basis, lights_file=lights_file)
         if job.baseline:
             heldout = [str(name) for name in separation.document.get("heldout", [])]
-            settings = recorded_settings(separation, job.result)
-            baseline = fit(
-                capture,
-                settings=settings,
-                calibration=recorded_calibration(separation),
-                heldout=heldout,
-                progress=progress,
-                scattering="none",
-            )
+            baseline = lin_lee(separation, capture, job.result, heldout, progress)
         rows = held_out_rows(separation, baseline or separation, capture)
     presentation.report(
         Path(job.out), separation, capture, result=job.result, baseline=baseline, heldout=rows, progress=progress

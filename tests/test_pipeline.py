@@ -159,7 +159,7 @@ def test_comparison_has_the_held_out_lights_and_the_truth(result, tmp_path):
     assert out.read_bytes().startswith(b"\x89PNG")
     lines = said.splitlines()
     assert [line.split()[0] for line in lines[1:5]] == ["L7", "L8", "L9", "L10"]
-    assert all("ours" in line and "Lin & Lee" in line for line in lines[1:5])
+    assert all(f"{name} " in line for name in ("ours", "Lin & Lee", "PTM", "Lambert") for line in lines[1:5])
     assert sum("of the truth" in line for line in lines) == 5
     assert not list(tmp_path.glob(".*"))
 

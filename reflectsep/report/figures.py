@@ -8,8 +8,8 @@ a gain, shared by ours and the baseline's and written under them. All difference
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +66,8 @@ class HeldOut:
     baseline: Float[Tensor, "channels height width"]
     counts: Bool[Tensor, "height width"] | None = None
     """Pixels of the object that the numbers are over; leave clipped ones out. All of the object where None."""
+    others: Mapping[str, Float[Tensor, "channels height width"]] = field(default_factory=dict)
+    """The same light by other methods, by name."""
 
 
 def write_comparison(
@@ -233,16 +235,16 @@ def _draw_held_out(
 def _check(row: ComparisonRow | HeldOut, mask: Tensor) -> None:
     """Refuse pictures of different shapes, and values on the object that are not finite."""
     shapes = set()
-    for field in fields(row):
-        picture = getattr(row, field.name)
+    for entry in fields(row):
+        picture = getattr(row, entry.name)
         if not isinstance(picture, Tensor) or picture.dtype == torch.bool:
             continue
         shapes.add(tuple(picture.shape))
         if picture.shape[-2:] != mask.shape:
             found, expected = tuple(picture.shape), tuple(mask.shape)
-            raise ValueError(f"light {row.light}: {field.name} of shape {found}, but the mask is {expected}")
+            raise ValueError(f"light {row.light}: {entry.name} of shape {found}, but the mask is {expected}")
         if not bool(torch.isfinite(picture[..., mask]).all()):
-            raise ValueError(f"light {row.light}: {field.name} has values on the object that are not finite")
+            raise ValueError(f"light {row.light}: {entry.name} has values on the object that are not finite")
     if len(shapes) != 1:
         raise ValueError(f"light {row.light}: pictures of shapes {sorted(shapes)}; expected one shape")
 
