@@ -76,13 +76,13 @@ def press(*signals):
 
 def press_twice(rig, monkeypatch):
     stage = rig.devices.stage
-    held = stage._held
+    held = stage._board.hold
 
     def again():
         signal.raise_signal(signal.SIGINT)
         return held()
 
-    monkeypatch.setattr(stage, "_held", again)
+    monkeypatch.setattr(stage._board, "hold", again)
     at_sweep(rig, MOVING, lambda: signal.raise_signal(signal.SIGINT))
 
 
@@ -288,7 +288,7 @@ FAULTS = {
         "was refused: error:1",
         "safe",
     ),
-    "feed hold by hand": (send(b"!"), "no end of the motion in time", "safe"),
+    "feed hold by hand": (send(b"!"), "is in state Hold:. in the middle of a motion", "safe"),
     "Ctrl-C once": (press(signal.SIGINT), "SIGINT", "safe"),
     "Ctrl-C twice": (press_twice, "SIGINT", "safe"),
     "Ctrl-C while an error is handled": (press_while_stopping, "no longer there", "safe"),

@@ -221,7 +221,7 @@ def babbled(chunks):
             stage.poll()
             clock.sleep(0.005)
     except ReflectsepError:
-        alarmed = stage._alarm is not None
+        alarmed = stage._board.alarm is not None
         sent = len(line.written)
         if alarmed:
             with pytest.raises(ReflectsepError):
