@@ -283,7 +283,6 @@ class GrblStage:
             self._end = None
             raise self._board.lock("it is in state Alarm")
         if status.state not in ("Run", "Idle"):
-            self._end = None
             raise StageError(f"{self._link.port}: is in state {status.state} in the middle of a motion, expected Run")
 
     def _index(self, axis: Axis) -> int:

@@ -243,14 +243,14 @@ def never_homed(rig, monkeypatch):
 
 def refused(answer):
     def inject(rig, monkeypatch):
-        plan = rig.bench.board._plan
+        move = rig.bench.board._move
         sent = []
 
-        def deny(axes, absolute):
+        def deny(asked):
             sent.append(1)
-            return answer if len(sent) > 6 else plan(axes, absolute)
+            return answer if len(sent) > 6 else move(asked)
 
-        monkeypatch.setattr(rig.bench.board, "_plan", deny)
+        monkeypatch.setattr(rig.bench.board, "_move", deny)
 
     return inject
 
@@ -422,7 +422,7 @@ def test_what_the_stage_cannot_do_is_refused_before_anything_moves(sweep, settin
 
 def test_a_slow_sweep_that_the_board_runs_too_fast_is_noticed(rig_in):
     rig = rig_in(sweep={"speed_mm_s": 0.13, "start_mm": -60.5, "end_mm": -60.0, "rate_hz": 5.0})
-    rig.bench.board._true_speed = lambda speed: speed * 1.22 if speed < 1 else speed
+    rig.bench.board.planner.true_speed = lambda speed: speed * 1.22 if speed < 1 else speed
     with pytest.raises(ReflectsepError, match=r"more than 0\.5 % off"):
         rig.run()
 
