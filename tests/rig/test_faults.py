@@ -544,16 +544,6 @@ def test_wall_clock_jump_changes_nothing(rig_in, monkeypatch, record_fault):
     record_fault("wall clock jumps", "nothing", "done", "complete", "not needed")
 
 
-def test_read_only_folder_says_so(tmp_path, rig_in, record_fault, monkeypatch):
-    def refuse(path, *rest, **options):
-        raise PermissionError(errno.EACCES, "Permission denied", str(path))
-
-    monkeypatch.setattr(session_module.os, "open", refuse)
-    with pytest.raises(PermissionError, match="Permission denied"):
-        rig_in().run()
-    record_fault("read-only folder", "Permission denied", "not begun", "nothing", "elsewhere")
-
-
 def test_plan_names_what_it_refuses():
     with pytest.raises(SettingsError, match=r"rig.devices.stage._target_=os.system: no such backend"):
         build("stage", {"_target_": "os.system"})
