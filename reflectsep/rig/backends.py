@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
 from reflectsep.errors import SettingsError
@@ -101,9 +101,22 @@ def _backend(kind: Kind, name: Any, where: str) -> Any:
     if isinstance(name, str) and name in known:
         module, attribute = known[name].split(":")
         return getattr(import_module(module), attribute)
-    for point in entry_points(group=ENTRY_POINTS):
-        if point.name == f"{kind}.{name}":
-            return point.load()
+    installed = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    point = installed.get(f"{kind}.{name}")
+    if point is not None:
+        return _loaded(point, where)
+    theirs = [key.removeprefix(f"{kind}.") for key in sorted(installed) if key.startswith(f"{kind}.")]
+    names = list(dict.fromkeys([*known, *theirs]))
     raise SettingsError(
-        f"{where}._target_={name}: no such backend{nearest(str(name), known)} (one of {', '.join(known)})"
+        f"{where}._target_={name}: no such backend{nearest(str(name), names)} (one of {', '.join(names)})"
     )
+
+
+def _loaded(point: EntryPoint, where: str) -> Any:
+    """The backend of an entry point; a package that is broken says so in one line."""
+    try:
+        return point.load()
+    except Exception as error:  # whatever another package does when it is imported
+        package = point.dist.name if point.dist is not None else point.value
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise SettingsError(f"{where}: {point.value} of {package} cannot be imported: {reason}") from error

@@ -135,6 +135,15 @@ class Runner:
         said = self.devices.lights.switch(light)
         self.session.event("light", asked=light or "off", read_back=said)
 
+    def snap(self, name: str) -> RawFrame:
+        """One picture; errors say which."""
+        try:
+            return self.devices.camera.snap(name)
+        except CameraError as error:
+            if name in str(error):
+                raise
+            raise CameraError(f"{name}: {error}") from error
+
     def look(self, what: str, seen: Brightness, exposure_s: float | None, *, slab: bool) -> None:
         """Warn where a picture is clipped or too dark."""
         text = warning(what, exposure_s, seen, slab=slab)
@@ -236,11 +245,11 @@ class Runner:
     def _whole(self, name: str) -> RawFrame:
         """A picture, tried again where it came damaged."""
         for _ in range(TRIES - 1):
-            frame = self.devices.camera.snap(name)
+            frame = self.snap(name)
             if frame.fault is None:
                 return frame
             self.warn(f"{name}: {frame.fault}; taken again")
-        return self.devices.camera.snap(name)
+        return self.snap(name)
 
     def _find_exposures(self) -> None:
         """Exposures of the plan, those of an earlier part of this session, or by test pictures."""

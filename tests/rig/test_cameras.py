@@ -26,6 +26,7 @@ from reflectsep.rig.frames import Stored, row
 from reflectsep.rig.marks import Switched, clock_of_marks
 
 from .conftest import complete
+from .recorder import Recorder
 
 PYTHON = sys.executable
 
@@ -140,55 +141,6 @@ def test_frames_that_came_out_of_order_are_put_in_order_with_gaps():
 # Video.
 
 
-class Recorder(VideoCamera):
-    """A video camera whose recording the test makes: of what a simulated camera sees meanwhile."""
-
-    def __init__(self, eye, **settings):
-        super().__init__(**settings)
-        self._eye, self._frames_seen = eye, []
-
-    def connect(self):
-        self._eye.connect()
-
-    def snap(self, name):
-        write_video(self._path.replace("{name}", name.replace("/", "-")), [(0.0, self._eye.snap(name).pixels)])
-        return super().snap(name)
-
-    def start(self, name, rate_hz):
-        super().start(name, rate_hz)
-        self._frames_seen = []
-        self._eye.start(name, rate_hz)
-
-    def poll(self):
-        self._frames_seen += self._eye.poll()
-        return ()
-
-    def stop(self):
-        if self._taking is None:
-            return ()
-        self._frames_seen += self._eye.stop()
-        first = self._frames_seen[0].device_time_s
-        pictures = [(f.device_time_s - first, f.pixels) for f in self._frames_seen]
-        write_video(self._path.replace("{name}", self._taking), pictures)
-        return super().stop()
-
-
-def write_video(path, pictures):
-    from fractions import Fraction
-
-    import av
-
-    with av.open(path, "w") as container:
-        stream = container.add_stream("ffv1", rate=25)  # a rate that is not the pictures'
-        stream.width, stream.height, stream.pix_fmt = 16, 12, "gray"
-        stream.codec_context.time_base = stream.time_base = Fraction(1, 1000)
-        for time_s, pixels in pictures:
-            frame = av.VideoFrame.from_ndarray(pixels, format="gray")
-            frame.pts, frame.time_base = round(time_s * 1000), Fraction(1, 1000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-
-
 def test_video_is_tied_to_the_motion_by_the_light_going_on_and_off(rig_in, tmp_path):
     pytest.importorskip("av")
     rig = rig_in()
@@ -223,7 +175,7 @@ def test_video_that_ends_early_or_is_none(tmp_path, record_fault):
     pytest.importorskip("av")
     rng = np.random.default_rng(0)
     path = tmp_path / "s.mkv"
-    write_video(str(path), [(0.1 * k, rng.integers(0, 255, (12, 16)).astype(np.uint8)) for k in range(20)])
+    Recorder.write(path, [(0.1 * k, rng.integers(0, 255, (12, 16)).astype(np.uint8)) for k in range(20)])
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     camera = VideoCamera(path=str(tmp_path / "{name}.mkv"), clock=VirtualClock(), timeout_s=5.0)
