@@ -124,3 +124,13 @@ def test_backend_settings_on_the_command_line_may_be_new_and_are_checked_by_the_
     assert main([*words, "rig.devices.camera.redout_s=0.1"]) == 2
     said = capsys.readouterr().err
     assert "rig.devices.camera.redout_s: no such setting of simulated; did you mean readout_s?" in said
+
+
+def test_backend_given_whole_on_the_command_line_takes_the_place_of_the_one_in_the_file(tmp_path, capsys):
+    from reflectsep.cli import main
+
+    words = ["capture", "object=wax", "rig=bench", f"out={tmp_path / 'c'}", "dry_run=true"]
+    assert main([*words, "rig.devices.lights={_target_: command, on: [switch, '{light}'], off: [switch, none]}"]) == 0
+    assert main([*words, "rig.devices.lights={_target_: command, on: switch, off: [switch, none]}"]) == 2
+    said = capsys.readouterr().err
+    assert "rig.devices.lights.on='switch': expected a list of arguments" in said

@@ -87,6 +87,8 @@ def build(kind: Kind, config: Mapping[str, Any], **session: Any) -> Any:
     missing = [key for key in known if parameters[key].default is inspect.Parameter.empty and key not in given]
     if missing:
         raise SettingsError(f"{where}.{missing[0]}: {name} needs it")
+    for key, value in given.items():
+        _check_type(f"{where}.{key}", value, str(parameters[key].annotation))
     if "bench" in parameters and session.get("bench") is None:
         raise SettingsError(f"{where}: {name} needs a simulated bench")
     own = {key: value for key, value in session.items() if key in parameters and not (open_ended and key == "clock")}
@@ -94,6 +96,24 @@ def build(kind: Kind, config: Mapping[str, Any], **session: Any) -> Any:
         return make(**given, **own)
     except (TypeError, ValueError) as error:
         raise SettingsError(f"{where}: {name}: {error}") from error
+
+
+PLAIN: dict[str, tuple[tuple[type, ...], str]] = {
+    "str": ((str,), "text (YAML reads on, off, yes and no as truth values: quote them)"),
+    "float": ((int, float), "a number"),
+    "int": ((int,), "a whole number"),
+    "bool": ((bool,), "true or false"),
+}
+
+
+def _check_type(where: str, value: Any, annotation: str) -> None:
+    """A plain value against the annotation of its argument; others are the backend's to check."""
+    first, _, rest = annotation.partition(" | ")
+    if first not in PLAIN or (value is None and rest == "None"):
+        return
+    types, words = PLAIN[first]
+    if not isinstance(value, types) or (isinstance(value, bool) and first != "bool"):
+        raise SettingsError(f"{where}={value!r}: expected {words}")
 
 
 def _backend(kind: Kind, name: Any, where: str) -> Any:

@@ -6,6 +6,7 @@ OSError from `in_waiting` and as termios.error, which is no OSError, from `flush
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -144,6 +145,9 @@ class SerialLink:
 
 
 def _reason(error: BaseException) -> str:
+    number = getattr(error, "errno", None)
+    if isinstance(number, int) and number > 0:
+        return os.strerror(number)  # pyserial repeats itself around it
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -340,6 +340,15 @@ def test_buffers_of_every_depth_and_mosaic():
         ("camera", {"_target_": "subprocess.Popen"}, "no such backend"),
         ("camera", {"_target_": "folder"}, "rig.devices.camera.folder: folder needs it"),
         ("camera", {"_target_": "folder", "foldr": "x"}, r"no such setting of folder; did you mean folder\?"),
+        (
+            "lights",
+            {"_target_": "serial", "port": "p", "off": False},
+            r"off=False: expected text \(YAML reads",
+        ),
+        ("lights", {"_target_": "serial", "port": "p", "baud": "fast"}, r"baud='fast': expected a whole number"),
+        ("stage", {"_target_": "grbl", "port": 3, "axes": {}}, r"stage\.port=3: expected text"),
+        ("camera", {"_target_": "folder", "folder": "f", "timeout_s": "long"}, "timeout_s='long': expected a number"),
+        ("camera", {"_target_": "gphoto2", "delete": "no"}, "delete='no': expected true or false"),
         ("lights", {"_target_": "command", "on": "echo", "off": ["x"]}, "expected a list of arguments"),
         ("lights", {"_target_": "simulated"}, "needs a simulated bench"),
         ("stage", {"_target_": "grbl", "port": "p", "axes": {"x": {"letter": "X"}}}, "axes.x.travel_mm: missing"),
@@ -348,6 +357,16 @@ def test_buffers_of_every_depth_and_mosaic():
 def test_configurations_that_cannot_be_built(kind, config, words):
     with pytest.raises(ReflectsepError, match=words):
         build(kind, config, clock=HostClock(), bench=None)
+
+
+def test_backends_of_the_package_s_rigs_can_be_built():
+    from reflectsep.cli.overrides import hydra_ready, settings_of
+
+    with hydra_ready():
+        for rig in ("bench", "bench_dslr"):
+            devices = settings_of("capture", ["object=wax", f"rig={rig}"]).rig.devices
+            for kind in BACKENDS:
+                build(kind, getattr(devices, kind), clock=HostClock())
 
 
 def test_every_backend_is_there():

@@ -402,7 +402,7 @@ def test_commands_before_the_banner_vanish_and_are_not_relied_on(rig_in):
     ("sweep", "settings", "words"),
     [
         ({"speed_mm_s": 0.1}, {}, "below 0.124 mm/s its motor steps too slowly"),
-        ({"speed_mm_s": 60.0}, {}, "it reaches 50 mm/s"),
+        ({"speed_mm_s": 60.0}, {}, "the stage reaches 50 mm/s"),
         ({"start_mm": -199.9}, {}, "with its run-up from -200.950 to"),
         ({"end_mm": -69.0}, {}, "its speed cannot be checked"),
         ({}, {110: 1000.0}, "is 16.6667 mm/s, less than max_speed_mm_s=50"),
