@@ -45,7 +45,7 @@ STRIP_PX = 0.25
 """Width of the strips whose scattering is transported; within one, light is taken as even."""
 MARGIN_PX = 2.0
 UNKNOWN_FRAME = 20_000_000
-"""Bytes allowed for a frame of a camera whose size is not known before it is connected."""
+"""Bytes of a frame that a dry run counts with, where the camera's size is not known before it is connected."""
 SIMULATED: dict[str, dict[str, Any]] = {
     "stage": {
         "_target_": "simulated",
@@ -96,7 +96,10 @@ def capture(job: CaptureJob, progress: Progress) -> str:
     session.open(resume=job.resume)
     try:
         options = RunOptions(
-            resume=job.resume, zeroed=job.zeroed, latency_s=job.rig.sweep.latency_s, frame_bytes=size_bytes
+            resume=job.resume,
+            zeroed=job.zeroed,
+            latency_s=job.rig.sweep.latency_s,
+            frame_bytes=0 if scene is None else size_bytes,
         )
         Runner(plan, devices, session, options, clock=clock, progress=progress, tell=tell).run()
         finish(session, plan)

@@ -70,6 +70,7 @@ class GrblStage:
         self._known = False
         self._homing = False
         self._baseline_s: float | None = None
+        self._arrived: dict[Axis, float] = {}
         self._still()
 
     def _still(self) -> None:
@@ -176,10 +177,14 @@ class GrblStage:
             raise StageError(f"{self._link.port}: no end of the motion in time; its position is unknown")
         return report
 
-    def halt(self) -> str:
+    def position(self, axis: Axis) -> float | None:
+        """As reported at the end of the last motion along it."""
+        return self._arrived.get(axis) if self._known else None
+
+    def halt(self) -> str | None:
         """`!`, wait for the end of the deceleration, then reset: so the position is kept."""
         if not self._link.is_open:
-            return "the stage is not connected"
+            return None
         was_known = self._known or self._end is not None
         self._known = False
         self._end = None
@@ -210,6 +215,7 @@ class GrblStage:
 
     def _find_home(self) -> None:
         self._board.alarm, self._known, self._homing = None, False, True
+        self._arrived.clear()
         self._board.command("$H", self._homing_s)
         self._homing = False
         state = self._board.status().state
@@ -254,6 +260,7 @@ class GrblStage:
                 f"{self._link.port}: the motion ended in state {status.state} at {axis} = {found:g} mm, "
                 f"expected Idle at {target_mm:g} mm"
             )
+        self._arrived[axis] = found
         self._known = True
 
     def _report(self) -> StageReport | None:

@@ -268,22 +268,22 @@ def _take_steps(
 ) -> Taken:
     """Frame by frame, the stage standing still for each: the position is what the stage reports at rest."""
     limits = runner.devices.stage.limits[shot.axis]
-    chosen, positions, times = [], [], []
+    chosen: list[Slot] = []
+    positions: list[float | None] = []
     began = runner.clock.now()
     for index in range(shot.frames):
-        target = shot.start_mm + index * shot.step_mm
-        runner.move(shot.axis, target)
+        reached = runner.move(shot.axis, shot.start_mm + index * shot.step_mm)
         values = store.add(runner.snap(f"{shot.name}/{index}"))
         if values is None:
             raise CameraError(f"{shot.name}/{index}: {store.stored[-1].fault}")
         _judge(runner, shot, store, exposure, values)
         chosen.append(Slot(file=store.stored[-1].file, time_s=runner.clock.now() - began))
-        positions.append(target)
-        times.append(runner.clock.now() - began)
+        positions.append(reached)
         progress(index + 1)
     if len(chosen) < 2:
         raise StageError(f"{shot.name}: {len(chosen)} frames; a sweep needs two or more")
     runner.switch(None)
-    facts: dict[str, Any] = {"count": len(chosen), "lost": [], "position_mm": positions, "time_s": times}
+    facts: dict[str, Any] = {"count": len(chosen), "lost": [], "position_mm": positions}
+    facts["time_s"] = [slot.time_s for slot in chosen]
     facts["position_sd_mm"] = [limits.step_mm] * len(chosen)
     return _moves(shot, chosen, facts)

@@ -11,7 +11,7 @@ import pytest
 import reflectsep
 from reflectsep.errors import SessionError
 
-SIZES_KB = (8, 16, 24, 100, 172)
+SIZES_KB = (8, 16, 32, 100, 172)
 """From one in which the session hardly begins to one that fills with the last frames of the sweep."""
 
 
@@ -41,7 +41,7 @@ def test_disk_that_fills_stops_the_rig_and_the_session_goes_on_when_there_is_roo
 
 def test_disks_fill_at_different_steps(disks):
     steps = {item["ended"][1].split(": ")[1] for item in disks if "ended" in item}
-    assert {"start", "full-L2", "sweep-L1-x"} <= steps
+    assert {"start", "full-L1", "sweep-L1-x"} <= steps
 
 
 def test_read_only_disk_says_so_before_anything_moves(disks, record_fault):

@@ -9,14 +9,17 @@ import json
 import re
 import signal
 import termios
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import serial
 
 from reflectsep.errors import ReflectsepError, SettingsError
+from reflectsep.rig import runner as runner_module
 from reflectsep.rig import session as session_module
 from reflectsep.rig.backends import build
+from reflectsep.rig.devices import RawFrame
 from reflectsep.rig.session import Session, read_events
 
 from .conftest import NAMES, complete, whole
@@ -319,6 +322,7 @@ def test_fault_stops_the_rig_keeps_the_disk_whole_and_is_resumed(fault, rig_in, 
     assert re.search(words, told), told
     assert "\n" not in str(caught.value)
     assert rig.bench.light is None
+    assert all(text.endswith("resume=true goes on from this step") for text in rig.told if ": stopped: " in text)
     motions = len(rig.bench.board.motion_lines)
     if state == "safe":
         assert rig.at_rest()
@@ -542,6 +546,24 @@ def test_wall_clock_jump_changes_nothing(rig_in, monkeypatch, record_fault):
     rig.run()
     assert complete(rig.folder).sweeps[0].count == 20
     record_fault("wall clock jumps", "nothing", "done", "complete", "not needed")
+
+
+def test_disk_without_room_for_what_the_first_picture_shows_is_refused(rig_in, monkeypatch):
+    rig = rig_in()
+    room = []
+
+    def usage(folder):
+        room.append(10**12 if not room else 10_000)
+        return SimpleNamespace(free=room[-1])
+
+    monkeypatch.setattr(runner_module.shutil, "disk_usage", usage)
+    rig.devices.camera.snap = lambda name: RawFrame(
+        pixels=np.random.default_rng(0).integers(0, 255, (30, 30), np.uint8)
+    )
+    with pytest.raises(ReflectsepError, match=r"0\.01 MB are free, up to 0\.\d+ MB are needed"):
+        rig.run()
+    assert rig.at_rest()
+    assert whole(rig.folder) == ["full-L1"]
 
 
 def test_plan_names_what_it_refuses():
