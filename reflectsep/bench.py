@@ -83,7 +83,7 @@ def capture(job: CaptureJob, progress: Progress) -> str:
     bench = None
     if scene is not None:
         bench = Bench(scene=scene, clock=clock, board=Board({22: 1.0}), park_mm=job.rig.sweep.park_mm)
-    devices = build_devices(config, clock=clock, bench=bench)  # type: ignore[arg-type]
+    devices = build_devices(config, clock=clock, bench=bench, scratch=Path(job.out))  # type: ignore[arg-type]
     plan = plan_of(job, scene)
     check_plan(plan, devices.stage.limits)
     size_bytes = UNKNOWN_FRAME if scene is None else math.prod(scene.size) * job.object.channels * 2

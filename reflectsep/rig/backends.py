@@ -10,6 +10,7 @@ import inspect
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Literal
 
 from reflectsep.errors import SettingsError
@@ -19,7 +20,7 @@ from reflectsep.settings import nearest
 
 Kind = Literal["stage", "camera", "lights"]
 ENTRY_POINTS = "reflectsep.rig"
-INJECTED = ("clock", "bench", "opener", "ask")
+INJECTED = ("clock", "bench", "scratch", "opener", "ask")
 """Arguments that come from the session, not from the configuration."""
 
 BACKENDS: dict[Kind, dict[str, str]] = {
@@ -45,18 +46,21 @@ BACKENDS: dict[Kind, dict[str, str]] = {
 }
 
 
-def build_devices(config: Mapping[Kind, Mapping[str, Any]], *, clock: Clock, bench: Any = None) -> Devices:
+def build_devices(
+    config: Mapping[Kind, Mapping[str, Any]], *, clock: Clock, bench: Any = None, scratch: Path | None = None
+) -> Devices:
     """The three devices of a rig; nothing is connected.
 
     Args:
         config: By kind: `_target_` and the arguments of the backend.
         clock: Of the session.
         bench: Of simulated devices.
+        scratch: Folder in which a camera may keep files until they are taken over; None: the system's.
 
     Raises:
         SettingsError: a backend that is not known, or arguments that it does not take.
     """
-    built = {kind: build(kind, config.get(kind) or {}, clock=clock, bench=bench) for kind in BACKENDS}
+    built = {kind: build(kind, config.get(kind) or {}, clock=clock, bench=bench, scratch=scratch) for kind in BACKENDS}
     names = {kind: str((config.get(kind) or {}).get("_target_")) for kind in BACKENDS}
     return Devices(stage=built["stage"], camera=built["camera"], lights=built["lights"], names=names)
 
@@ -67,7 +71,7 @@ def build(kind: Kind, config: Mapping[str, Any], **session: Any) -> Any:
     Args:
         kind: Which list to look in.
         config: `_target_` and the backend's arguments.
-        **session: What the session gives: `clock`, `bench`.
+        **session: What the session gives: `clock`, `bench`, `scratch`.
 
     Raises:
         SettingsError: as `build_devices`.
@@ -80,7 +84,8 @@ def build(kind: Kind, config: Mapping[str, Any], **session: Any) -> Any:
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     if open_ended:  # simulated_stage hands on to the driver
         parameters = {**inspect.signature(_backend(kind, "grbl", where)).parameters, **parameters}
-    known = [key for key in parameters if key not in (*INJECTED, "settings", *(("port",) if open_ended else ()))]
+    # What it hands on has a name, which is no setting, and its port is the bench.
+    known = [key for key in parameters if key not in (*INJECTED, *(("settings", "port") if open_ended else ()))]
     for key in given:
         if key not in known:
             raise SettingsError(f"{where}.{key}: no such setting of {name}{nearest(key, known)} ({', '.join(known)})")

@@ -18,7 +18,7 @@ from reflectsep.errors import CameraError, MissingExtraError
 from reflectsep.io.pictures import SUFFIXES
 from reflectsep.rig.clock import Clock, HostClock
 from reflectsep.rig.devices import CameraLimits, RawFrame
-from reflectsep.rig.still import StillCamera
+from reflectsep.rig.still import StillCamera, scratch_folder
 
 SHUTTER = ("shutterspeed", "shutterspeed2", "exptime")
 NO_ROOM = (-3, -115)
@@ -35,6 +35,7 @@ class Gphoto2Camera(StillCamera):
         settings: Set when connecting, e.g. `iso: "100"`.
         delete: Take each picture off the card once it has been fetched, so that the card does not fill.
         clock: The session's.
+        scratch: Folder for the files until they are taken over; None: the system's.
     """
 
     def __init__(
@@ -44,9 +45,11 @@ class Gphoto2Camera(StillCamera):
         settings: Mapping[str, str] | None = None,
         delete: bool = True,
         clock: Clock | None = None,
+        scratch: Path | None = None,
     ) -> None:
         self._model, self._settings, self._delete = model, dict(settings or {}), delete
         self._clock = clock or HostClock()
+        self._scratch = scratch
         self._gp: Any = None
         self._camera: Any = None
         self._shutter: str | None = None
@@ -116,7 +119,7 @@ class Gphoto2Camera(StillCamera):
             self._folder = None
 
     def _find(self) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="reflectsep-camera-")
+        self._folder = scratch_folder(self._scratch)
         with _Errors(self._gp, f"camera {self._model or '(any)'}"):
             self._camera = self._gp.Camera()
             self._camera.init()

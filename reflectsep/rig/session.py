@@ -65,7 +65,7 @@ class Session:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._take_lock()
             for leftover in self.folder.glob(".*.part*"):
-                leftover.unlink()
+                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
             self._open_log()
             self._document = self._read() if self.exists else {"format": FORMAT, "steps": {}}
         except BaseException as error:
@@ -184,7 +184,8 @@ class Session:
 
     def _only_ours(self) -> bool:
         """Whether a session was killed in this folder before its first manifest."""
-        return {p.name for p in self.folder.iterdir() if not p.name.endswith(".part.json")} <= {EVENTS, LOCK}
+        names = {p.name for p in self.folder.iterdir() if not (p.name.startswith(".") and ".part" in p.name)}
+        return names <= {EVENTS, LOCK}
 
     def _take_lock(self) -> None:
         import fcntl

@@ -219,6 +219,8 @@ def record_fault(request):
         if path:
             cells = [fault, seen, state, disk, resumed]
             with open(path, "a") as table:
+                if table.tell() == 0:
+                    table.write("| fault | what is seen | the rig | on disk | resume |\n|---|---|---|---|---|\n")
                 table.write("| " + " | ".join(str(cell).replace("|", "/") for cell in cells) + " |\n")
 
     return record

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import imagecodecs
@@ -71,7 +72,8 @@ def command_rig(rig_in, folder, fault, fails):
         (folder / "fails").touch()
     rig = rig_in(sweep=STEPPED)
     take = [sys.executable, "-S", str(folder / "program.py"), str(folder), "{file}", "{name}"]
-    return with_camera(rig, CommandCamera(take=take, timeout_s=1.0 if "sleep" in fault else 20.0))
+    timeout_s = 1.0 if "sleep" in fault else 20.0
+    return with_camera(rig, CommandCamera(take=take, timeout_s=timeout_s, scratch=rig.folder))
 
 
 @pytest.mark.parametrize(
@@ -88,6 +90,24 @@ def test_command_that_fails_in_a_sweep(fault, words, rig_in, tmp_path, record_fa
         return command_rig(rig_in, tmp_path, fault, fails)
 
     fails_then_completes(make, words, 5, record_fault, f"external command: {fault}")
+
+
+def test_files_of_a_command_stay_in_the_session_and_what_a_crash_left_of_them_is_swept_away(
+    rig_in, tmp_path, monkeypatch
+):
+    rig = command_rig(rig_in, tmp_path, "pass", False)
+    left = rig.folder / ".camera.killed.part"
+    left.mkdir(parents=True)
+    (left / "000003.png").write_bytes(b"half")
+    (tmp_path / "system").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "system"))
+    seen = []
+    snap = rig.devices.camera.snap
+    rig.devices.camera.snap = lambda name: seen.append(snap(name)) or seen[-1]
+    rig.run()
+    assert {frame.file.parent.parent for frame in seen} == {rig.folder}
+    assert list((tmp_path / "system").iterdir()) == []
+    assert [path.name for path in rig.folder.iterdir() if path.name.startswith(".")] == []
 
 
 # Video.

@@ -369,6 +369,11 @@ def test_backends_of_the_package_s_rigs_can_be_built():
                 build(kind, getattr(devices, kind), clock=HostClock())
 
 
+def test_settings_of_a_dslr_can_be_configured():
+    camera = build("camera", {"_target_": "gphoto2", "settings": {"iso": "100"}}, clock=HostClock())
+    assert camera._settings == {"iso": "100"}
+
+
 def test_every_backend_is_there():
     for kind, names in BACKENDS.items():
         for name, place in names.items():

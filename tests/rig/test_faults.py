@@ -396,10 +396,11 @@ def test_few_lost_frames_stay_lost_and_null(rig_in, record_fault):
     record_fault("a dropped frame", "nothing", "done", "null in the manifest", "not needed")
 
 
-def test_commands_before_the_banner_vanish_and_are_not_relied_on(rig_in):
+def test_commands_before_the_banner_vanish_and_are_not_relied_on(rig_in, record_fault):
     rig = rig_in()
     rig.run()
     assert rig.bench.board.motion_lines[0][0] > 1.0
+    record_fault("commands before the banner", "nothing", "waits for the banner", "complete", "not needed")
 
 
 @pytest.mark.parametrize(
@@ -486,12 +487,13 @@ def test_changed_plan_firmware_or_camera_refuses_to_go_on(rig_in, record_fault):
     complete(rig.folder)
 
 
-def test_existing_session_needs_resume_and_a_finished_one_has_nothing_to_do(rig_in):
+def test_existing_session_needs_resume_and_a_finished_one_has_nothing_to_do(rig_in, record_fault):
     rig = rig_in()
     rig.run()
     with pytest.raises(ReflectsepError, match="say resume=true"):
         rig_in().run()
     assert Session(rig.folder).finished
+    record_fault("finished session", "finished already, nothing to do", "not connected", "unchanged", "nothing to do")
 
 
 def test_stage_without_switches_goes_on_only_when_a_person_has_zeroed_it(rig_in):
