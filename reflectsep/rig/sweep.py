@@ -249,13 +249,12 @@ def _camera_clock(shot: SlabSweep, recording: Recording, store: FrameStore, late
 
 def _check_lost(shot: SlabSweep, chosen: list[Slot], store: FrameStore, max_lost: float) -> None:
     lost = sum(slot.file is None for slot in chosen)
-    why = next((s.fault for s in store.stored if s.fault), None)
+    why = next((f" ({s.fault})" for s in store.stored if s.fault), "")
     if len(chosen) < max(2, shot.frames - 2):
-        raise CameraError(f"{shot.name}: {len(chosen)} frames during the sweep, expected {shot.frames}")
+        raise CameraError(f"{shot.name}: {len(chosen)} frames during the sweep, expected {shot.frames}{why}")
     if lost > max_lost * len(chosen):
         raise CameraError(
-            f"{shot.name}: {lost} of {len(chosen)} frames were lost{f' ({why})' if why else ''}, "
-            f"at most {100 * max_lost:g} % may be"
+            f"{shot.name}: {lost} of {len(chosen)} frames were lost{why}, at most {100 * max_lost:g} % may be"
         )
 
 

@@ -67,17 +67,14 @@ def test_command_writes_the_file_and_gets_the_exposure_as_one_argument(tmp_path)
         ("", "succeeded, but wrote no file"),
     ],
 )
-def test_command_that_fails_hangs_or_writes_nothing(body, words, tmp_path, record_fault):
+def test_command_that_fails_hangs_or_writes_nothing(body, words, tmp_path):
     camera = command(tmp_path, body, timeout_s=0.5 if "sleep" in body else 20.0)
     camera.connect()
     began = time.monotonic()
-    with pytest.raises(CameraError, match=words) as caught:
+    with pytest.raises(CameraError, match=words):
         camera.snap("x")
     assert time.monotonic() - began < 15
     camera.close()
-    record_fault(
-        f"external command: {words}", str(caught.value), "stopped as by every camera error", "no file", "completes"
-    )
 
 
 def test_command_is_a_list_and_never_a_string():
@@ -171,7 +168,7 @@ def test_video_is_tied_to_the_motion_by_the_light_going_on_and_off(rig_in, tmp_p
     assert 0.1 < max(stated) < 0.3  # 1 mm / sqrt(12), of two switchings
 
 
-def test_video_that_ends_early_or_is_none(tmp_path, record_fault):
+def test_video_that_ends_early_or_is_none(tmp_path):
     pytest.importorskip("av")
     rng = np.random.default_rng(0)
     path = tmp_path / "s.mkv"
@@ -187,9 +184,6 @@ def test_video_that_ends_early_or_is_none(tmp_path, record_fault):
         camera.snap("t")
     with pytest.raises(CameraError, match=r"u\.mkv: no whole video in 5 s"):
         camera.snap("u")
-    record_fault(
-        "video truncated", "20 frames expected, fewer came", "stopped by the count", "step not done", "completes"
-    )
 
 
 def test_clock_of_marks_finds_the_offset_and_refuses_frames_that_show_nothing():

@@ -292,6 +292,7 @@ FAULTS = {
         "safe",
     ),
     "feed hold by hand": (send(b"!"), "is in state Hold:. in the middle of a motion", "safe"),
+    "safety door opened": (send(b"\x84"), "is in state Door:. in the middle of a motion", "safe"),
     "Ctrl-C once": (press(signal.SIGINT), "SIGINT", "safe"),
     "Ctrl-C twice": (press_twice, "SIGINT", "safe"),
     "Ctrl-C while an error is handled": (press_while_stopping, "no longer there", "safe"),
@@ -361,7 +362,7 @@ def reorder(rig, monkeypatch):
 
 
 SURVIVED = {
-    "nothing": lambda rig, m: None,
+    "no fault": lambda rig, m: None,
     "noise and partial lines from the board": bend,
     "duplicate frames": lambda rig, m: setattr(rig, "change", lambda frame: [frame, frame]),
     "reordered frames": reorder,
