@@ -17,6 +17,8 @@ from reflectsep.rig.link import SerialLink
 QUESTION_EVERY_S = 0.2
 """More than five questions a second take the board's time from its motors."""
 REPORT_WAIT_S = 0.25
+FORGOTTEN_S = 1.0
+"""After which a question that was not answered will not be."""
 LATCH_S = 0.0005
 """From sending `?` to the moment whose position is reported."""
 ALARM_BLOCKS_S = 0.6
@@ -56,6 +58,8 @@ class GrblProtocol:
         """Of the feed, as told last: the board tells it in every tenth or twentieth report, and when it changes."""
         self._status: Status | None = None
         self._answers: list[str] = []
+        self._asked: list[float] = []
+        """When the questions were sent that are not answered yet, the oldest first."""
         self._question_s = self._deaf_s = -float("inf")
 
     @property
@@ -111,17 +115,21 @@ class GrblProtocol:
             AlarmError: the board locked itself, or was reset.
         """
         self._clock.sleep(max(0.0, self._question_s - self._clock.now()))
+        self._listen()
         self._status = None
         before = self._clock.now()
         self._question_s = before + QUESTION_EVERY_S
+        self._asked = [*(sent_s for sent_s in self._asked if before - sent_s < FORGOTTEN_S), before]
         self._link.write(QUESTION)
         after = self._clock.now()
         deadline = Deadline.after(self._clock, wait_s)
+        # A report that comes late answers an earlier question, or this one: its position is of any moment between.
+        since = self._asked[0]
         while self._status is None and (line := self._link.read_line(deadline)) is not None:
             self._sort(line)
         if self._status is None:
             return None
-        return Answered(status=self._status, time_s=(before + after) / 2 + LATCH_S, uncertainty_s=(after - before) / 2)
+        return Answered(status=self._status, time_s=(since + after) / 2 + LATCH_S, uncertainty_s=(after - since) / 2)
 
     @property
     def question_due(self) -> bool:
@@ -142,8 +150,7 @@ class GrblProtocol:
 
     def answers(self) -> list[str]:
         """`ok` and `error:N` that came since the last line was sent, each once; looks at what has come."""
-        while (line := self._link.read_line(Deadline.after(self._clock, 0.0))) is not None:
-            self._sort(line)
+        self._listen()
         taken, self._answers = self._answers, []
         return taken
 
@@ -170,6 +177,7 @@ class GrblProtocol:
         for _ in range(RESETS):
             self._link.write(RESET)
             if self._saw_banner(Deadline.after(self._clock, self._boot_s / RESETS), []):
+                self._asked.clear()
                 self._settle()
                 return
         raise StageError(f"{self.port}: no answer to a reset")
@@ -213,8 +221,14 @@ class GrblProtocol:
         status = parse_status(line)
         if status is not None:
             self._status = status
+            del self._asked[:1]
             if status.override_percent is not None:
                 self.override_percent = status.override_percent
+
+    def _listen(self) -> None:
+        """Take in what has come, without waiting."""
+        while (line := self._link.read_line(Deadline.after(self._clock, 0.0))) is not None:
+            self._sort(line)
 
     def _sort(self, line: str) -> None:
         """A line that came while no command was waiting for it."""

@@ -91,9 +91,10 @@ class SerialLink:
             line = self._taken()
             if line is not None:
                 return line
-            if deadline.passed:
+            if not deadline.passed:
+                self._receive()
+            elif not self._came():
                 return None
-            self._receive()
 
     def drop_input(self) -> None:
         """Forget what has come so far.
@@ -132,6 +133,14 @@ class SerialLink:
         with self._lost("reading"):
             waiting = self._line.in_waiting
             self._bytes += self._line.read(min(max(1, waiting), 4096))
+
+    def _came(self) -> bool:
+        """Take what has come, without waiting: a host that was asleep at the deadline still has it."""
+        with self._lost("reading"):
+            waiting = self._line.in_waiting
+            got = self._line.read(min(waiting, 4096)) if waiting else b""
+        self._bytes += got
+        return bool(got)
 
     @contextmanager
     def _lost(self, doing: str) -> Iterator[None]:

@@ -116,8 +116,15 @@ def test_slit_position_of_500_frames_in_simulated_time():
 
 @pytest.mark.slow
 def test_slit_position_of_500_frames_in_real_time():
-    with Firmware() as firmware:
-        check_500_frames(stage_on(firmware, reference="here"), HostClock(), firmware.true_position)
+    for _ in range(3):
+        with Firmware() as firmware:
+            try:
+                check_500_frames(stage_on(firmware, reference="here"), HostClock(), firmware.true_position)
+                return
+            except (StageError, AssertionError):
+                if firmware.late_s < 0.008:  # what 20 um take at 2 mm/s, with room for the fit
+                    raise
+    pytest.skip("this machine is too busy to be a board in real time")
 
 
 def check_500_frames(stage, clock, true_position):
@@ -318,6 +325,50 @@ def test_questions_are_five_a_second_at_most():
     asked = [time_s for time_s, data in written if data == b"?"]
     assert len(asked) > 15
     assert np.diff(asked).min() >= 0.2 - 1e-9
+
+
+class Sleepy(SimulatedSerial):
+    """A line whose host falls asleep once, for 0.33 s, between a question and its answer."""
+
+    def __init__(self, bench, nap_at_s, late):
+        super().__init__(bench)
+        self._nap_at_s, self._late = nap_at_s, late
+
+    def write(self, data):
+        count = super().write(data)
+        if data == b"?" and self._nap_at_s and self._bench.clock.now() > self._nap_at_s:
+            self._nap_at_s = None
+            if self._late:
+                self._awake_s = self._bench.clock.now() + 0.33
+            else:
+                self._bench.clock.sleep(0.33)
+        return count
+
+    @property
+    def in_waiting(self):
+        return 0 if self._late and self._bench.clock.now() < getattr(self, "_awake_s", 0.0) else super().in_waiting
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["the host slept", "the answer came late"])
+def test_report_is_never_taken_for_the_answer_to_a_later_question(late):
+    bench = Bench(scene=Stripe(), board=Board({}))
+    stage = GrblStage(
+        port="p",
+        axes={"x": AXIS},
+        reference="here",
+        clock=bench.clock,
+        opener=lambda _port, **_: Sleepy(bench, 4.0, late),
+    )
+    stage.connect()
+    stage.home()
+    stage.begin("x", -50.0, 10.0)
+    reports = finish(stage, bench.clock)
+    assert len(reports) > 20
+    for report in reports:
+        early, late_s = report.time_s - report.uncertainty_s, report.time_s + report.uncertainty_s
+        places = [bench.board.trace.at(t)[0] for t in (early, late_s)]
+        assert min(places) - 0.01 <= report.position_mm <= max(places) + 0.01
+    assert sum(report.uncertainty_s > 0.05 for report in reports) <= 3
 
 
 def test_startup_lines_that_set_inches_do_not_change_a_motion():
