@@ -11,7 +11,7 @@ import pytest
 import reflectsep
 from reflectsep.errors import SessionError
 
-SIZES_KB = (8, 16, 32, 100, 172)
+SIZES_KB = (8, 16, 32, 100, 148)
 """From one in which the session hardly begins to one that fills with the last frames of the sweep."""
 
 
