@@ -45,7 +45,7 @@ STRIP_PX = 0.25
 """Width of the strips whose scattering is transported; within one, light is taken as even."""
 MARGIN_PX = 2.0
 UNKNOWN_FRAME = 20_000_000
-"""Bytes allowed for a frame of a camera whose size is not known before it is connected."""
+"""Bytes of a frame that a dry run counts with, where the camera's size is not known before it is connected."""
 SIMULATED: dict[str, dict[str, Any]] = {
     "stage": {
         "_target_": "simulated",
@@ -83,7 +83,7 @@ def capture(job: CaptureJob, progress: Progress) -> str:
     bench = None
     if scene is not None:
         bench = Bench(scene=scene, clock=clock, board=Board({22: 1.0}), park_mm=job.rig.sweep.park_mm)
-    devices = build_devices(config, clock=clock, bench=bench)  # type: ignore[arg-type]
+    devices = build_devices(config, clock=clock, bench=bench, scratch=Path(job.out))  # type: ignore[arg-type]
     plan = plan_of(job, scene)
     check_plan(plan, devices.stage.limits)
     size_bytes = UNKNOWN_FRAME if scene is None else math.prod(scene.size) * job.object.channels * 2
@@ -96,7 +96,10 @@ def capture(job: CaptureJob, progress: Progress) -> str:
     session.open(resume=job.resume)
     try:
         options = RunOptions(
-            resume=job.resume, zeroed=job.zeroed, latency_s=job.rig.sweep.latency_s, frame_bytes=size_bytes
+            resume=job.resume,
+            zeroed=job.zeroed,
+            latency_s=job.rig.sweep.latency_s,
+            frame_bytes=0 if scene is None else size_bytes,
         )
         Runner(plan, devices, session, options, clock=clock, progress=progress, tell=tell).run()
         finish(session, plan)

@@ -76,11 +76,13 @@ def test_orthogonal_sweeps_go_along_y(tmp_path):
     assert [(s.light, s.direction) for s in load_capture(tmp_path / "c").sweeps] == [("L1", "x"), ("L1", "y")]
 
 
-def test_stepped_sweep_has_the_positions_that_were_asked_for(tmp_path):
+def test_stepped_sweep_has_the_positions_that_the_stage_reported(tmp_path):
     settings = SweepSettings(motion="stepped", rate_hz=10.0, speed_mm_s=10.0)
     capture(job(tmp_path / "c", sweeps=1, lights=3, sweep=settings), silent)
     (sweep,) = load_capture(tmp_path / "c").sweeps
-    assert np.diff(sweep.position_mm) == pytest.approx(1.0)
+    # One millimetre each, in whole steps of 4 um as the board has them.
+    assert np.diff(sweep.position_mm) == pytest.approx(1.0, abs=0.0041)
+    assert np.array(sweep.position_mm) * 250 == pytest.approx(np.rint(np.array(sweep.position_mm) * 250), abs=1e-6)
 
 
 def test_names_of_lights_cannot_lead_out_of_the_session(tmp_path):
@@ -124,3 +126,13 @@ def test_backend_settings_on_the_command_line_may_be_new_and_are_checked_by_the_
     assert main([*words, "rig.devices.camera.redout_s=0.1"]) == 2
     said = capsys.readouterr().err
     assert "rig.devices.camera.redout_s: no such setting of simulated; did you mean readout_s?" in said
+
+
+def test_backend_given_whole_on_the_command_line_takes_the_place_of_the_one_in_the_file(tmp_path, capsys):
+    from reflectsep.cli import main
+
+    words = ["capture", "object=wax", "rig=bench", f"out={tmp_path / 'c'}", "dry_run=true"]
+    assert main([*words, "rig.devices.lights={_target_: command, on: [switch, '{light}'], off: [switch, none]}"]) == 0
+    assert main([*words, "rig.devices.lights={_target_: command, on: switch, off: [switch, none]}"]) == 2
+    said = capsys.readouterr().err
+    assert "rig.devices.lights.on='switch': expected a list of arguments" in said

@@ -59,8 +59,14 @@ def composed(job: str, overrides: Sequence[str]) -> DictConfig:
     Raises:
         SettingsError: one line that names the key.
     """
+    keys = tuple(f"{key}={{" for key in _open_keys(JOBS[job]))
+    whole = [word for word in overrides if word.startswith(keys)]
     try:
-        return compose(f"{job}_job", list(overrides))
+        config = compose(f"{job}_job", [word for word in overrides if word not in whole])
+        for override in _parsed(whole):
+            # A backend given whole takes the place of the one in the YAML; Hydra would merge the two.
+            OmegaConf.update(config, override.get_key_element(), override.value(), merge=False, force_add=True)
+        return config
     except (HydraException, OmegaConfBaseException) as error:
         raise _one_line(error, JOBS[job], overrides) from None
 
@@ -116,8 +122,13 @@ def checked(job: str, words: Sequence[str], *, sweeping: bool) -> list[str]:
         seen.add(override.key_or_group)
         _check_override(cls, override, sweeping)
     # A backend's settings differ from those of the one in the YAML: they may be new there, and the backend checks them.
-    open_keys = tuple(f"{name}." for name, kind in _keys(cls).items() if kind.base is dict)
+    open_keys = tuple(f"{name}." for name in _open_keys(cls))
     return [f"++{word}" if word.startswith(open_keys) else word for word in overrides]
+
+
+def _open_keys(cls: type) -> list[str]:
+    """Settings that take any keys: the backends of devices."""
+    return [name for name, kind in _keys(cls).items() if kind.base is dict]
 
 
 def _schema(cls: type) -> type:

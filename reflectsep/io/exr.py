@@ -7,6 +7,7 @@ and uint8 pixels are refused. So: one contiguous 2-D array a channel, in diction
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,7 @@ def write_channels(
     Raises:
         ValueError: no channels, a channel that is not 2-D, of another size or of another type, or a name that OpenEXR
             cannot hold.
+        OSError: the disk is full or cannot be written.
     """
     if not channels:
         raise ValueError(f"{path}: no channels to write")
@@ -83,7 +85,11 @@ def write_channels(
 
     def write(temporary: Path) -> None:
         with OpenEXR.File(header, pixels) as file:
-            file.write(str(temporary))
+            try:
+                file.write(str(temporary))
+            except RuntimeError as error:  # how the library tells of a full disk
+                reason = str(error).rsplit('". ', 1)[-1].strip().rstrip(".")
+                raise OSError(errno.EIO, reason, str(path)) from error
 
     atomic_write(path, write)
 

@@ -11,27 +11,26 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from reflectsep.rig.gcode import Dwell, Interpreter, Move, Refused
 from reflectsep.rig.motion import Point, Trace
+from reflectsep.rig.planner import Planner
+from reflectsep.rig.reports import Reports, Seen
 
 BUFFER = 128
-PLANNED = 15
-"""Motions that the planner holds besides the one under way."""
-BOOT_S = 1.0
+BOOT_S, RESTART_S = 1.0, 0.01
 LATCH_S, TELL_S = 0.0005, 0.0042
-FIRST_STEP_S = 0.015
 DWELL_EXTRA_S = 0.08
 ALARM_S = 0.5
-SLOWEST_STEPS_S = 30.5
+"""For which an alarm blocks everything; a reset that comes meanwhile after a limit was met is forgotten."""
 BANNER = "\r\nGrbl 1.1h ['$' for help]\r\n"
-REALTIME = b"?!~\x18\x90\x91\x92\x93\x94"
+REALTIME = b"?!~\x18\x84\x90\x91\x92\x93\x94"
 SETTINGS = {
-    **{0: 10.0, 1: 25.0, 10: 1.0, 20: 0.0, 21: 0.0, 22: 0.0, 23: 0.0, 24: 60.0, 25: 500.0, 26: 250.0, 27: 1.0},
+    **{0: 10.0, 1: 25.0, 10: 1.0, 13: 0.0, 20: 0.0, 21: 0.0, 22: 0.0, 23: 0.0, 24: 60.0, 25: 500.0, 26: 250.0, 27: 1.0},
     **{100: 250.0, 101: 250.0, 102: 250.0, 110: 3000.0, 111: 3000.0, 112: 3000.0},
     **{120: 100.0, 121: 100.0, 122: 100.0, 130: 200.0, 131: 200.0, 132: 200.0},
 }
-_WORD = re.compile(r"([A-Z])([-+]?\d*\.?\d+)")
 
 
 class Board:
@@ -40,30 +39,46 @@ class Board:
     Args:
         settings: Changes to `SETTINGS`.
         homing_s: Least time of `$H`.
+        startup: Lines that it runs by itself after a reset.
     """
 
-    def __init__(self, settings: Mapping[int, float] | None = None, *, homing_s: float = 4.0) -> None:
+    def __init__(
+        self, settings: Mapping[int, float] | None = None, *, homing_s: float = 4.0, startup: Sequence[str] = ()
+    ) -> None:
         self.settings = {**SETTINGS, **(settings or {})}
-        self.homing_s = homing_s
-        self.trace = Trace()
-        """Of the board's own belief; the carriage is `slip_mm` from it along X."""
+        self.homing_s, self.startup = homing_s, tuple(startup)
+        self.planner = Planner(self.settings)
         self.slip_mm = 0.0
-        self.override = 100
+        """Of the carriage from where the board believes it to be, along X."""
         self.motion_lines: list[tuple[float, str]] = []
         """Every line that asked for motion, with its time: for whoever watches."""
         self._out: deque[tuple[float, bytes]] = deque()
         self._now_s = 0.0
         self._state = "Off"
-        self._clear()
+        self._restart(0.0, locked=False)
+        self._state = "Off"
+
+    @property
+    def trace(self) -> Trace:
+        """Of the board's own belief; the carriage is `slip_mm` from it along X."""
+        return self.planner.trace
+
+    @property
+    def override(self) -> int:
+        """Of the feed, in per cent."""
+        return self.planner.override
+
+    @override.setter
+    def override(self, percent: int) -> None:
+        self.planner.override = percent
+        self._reports.tell_overrides()
 
     def power_on(self, now_s: float) -> None:
         """Power, or the reset that opening the port causes: everything is forgotten, the position is 0."""
         self._now_s = now_s
         self.trace.jump(now_s, (0.0, 0.0, 0.0))
         self._out.clear()
-        self._clear()
-        self.override = 100
-        self._state, self._busy_s = "Boot", now_s + BOOT_S
+        self._restart(BOOT_S, locked=self.settings[22] == 1)
 
     def position(self, time_s: float) -> Point:
         """Where the carriage really is."""
@@ -72,7 +87,7 @@ class Board:
 
     @property
     def state(self) -> str:
-        """As it would report it, or Boot, Dead (locked until reset)."""
+        """As it would report it, or Off, Boot, Dead (locked until reset)."""
         return self._state
 
     def receive(self, data: bytes, now_s: float) -> None:
@@ -110,38 +125,37 @@ class Board:
 
     def alarm(self, code: int, *, dead: bool) -> None:
         """Lock, as a limit switch or a soft limit does; `dead`: until a reset."""
-        moving = self.trace.speed_at(self._now_s) > 0
-        self.trace.jump(self._now_s, self.trace.at(self._now_s))
-        if moving:
+        if self.planner.stop(self._now_s):
             self.slip_mm += 1.0 / self.settings[100]
-        self._queue.clear()
         self._buffer.clear()
         self._dwell_s = self._homing = None
         self._say(f"ALARM:{code}")
         self._state = "Dead" if dead else "Alarm"
         self._deaf_s = self._now_s + ALARM_S
+        if dead:
+            self._say("[MSG:Reset to continue]", at_s=self._deaf_s)
 
-    def _clear(self) -> None:
+    def _restart(self, after_s: float, *, locked: bool) -> None:
+        """Everything but the position and the settings is forgotten."""
         self._buffer = bytearray()
-        self._queue: deque[tuple[Point, float]] = deque()
-        self._planned: Point | None = None
-        self._feed: float | None = None
-        self._absolute, self._motion = True, 1
+        self._interpreter = Interpreter()
+        self.planner.clear()
+        self.planner.override = 100
         self._dwell_s: float | None = None
         self._homing: float | None = None
-        self._held: tuple[Point, float] | None = None
-        self._current: tuple[Point, float] | None = None
-        self._busy_s = self._now_s
         self._deaf_s = -math.inf
+        self._reports = Reports()
+        self._stale = False
+        self._state, self._locked, self._busy_s = "Boot", locked, self._now_s + after_s
 
     def _next_s(self) -> float | None:
         """When something happens next by itself."""
-        times = []
         if self._state == "Boot":
             return self._busy_s
         if self._homing is not None:
             return self._homing
-        if self._state == "Hold:1" or (self._current is not None and self._state in ("Run", "Jog")):
+        times = []
+        if self._state in ("Hold:1", "Door:2") or (self.planner.current is not None and self._state in ("Run", "Jog")):
             times.append(self.trace.end_s)
         if self._dwell_s is not None:
             times.append(self._dwell_s)
@@ -152,36 +166,44 @@ class Board:
     def _happen(self) -> bool:
         now = self._now_s
         if self._state == "Boot":
-            self._out.append((now, BANNER.encode()))
-            self._state = "Alarm" if self.settings[22] == 1 else "Idle"
-            if self._state == "Alarm":
-                self._say("[MSG:'$H'|'$X' to unlock]")
-            return True
-        if self._homing is not None:
+            self._booted()
+        elif self._homing is not None:
             self._homed()
-            return True
-        if self._state == "Hold:1" and self.trace.end_s <= now:
-            self._state = "Hold:0"
-            return True
-        if self._current is not None and self._state in ("Run", "Jog") and self.trace.end_s <= now:
-            self._current = None
-            self._start_next()
-            return True
-        if self._dwell_s is not None and self._dwell_s <= now:
+        elif self._state in ("Hold:1", "Door:2") and self.trace.end_s <= now:
+            self._state = self._state[:-1] + "0"
+        elif self.planner.current is not None and self._state in ("Run", "Jog") and self.trace.end_s <= now:
+            self._go_on()
+        elif self._dwell_s is not None and self._dwell_s <= now:
             self._dwell_s = None
             self._say("ok")
-            return True
-        if self._dwell_s is None and self._line_ready() and self._busy_s <= now:
+        elif self._dwell_s is None and self._line_ready() and self._busy_s <= now:
             self._take_line()
-            return True
-        return False
+        else:
+            return False
+        return True
+
+    def _booted(self) -> None:
+        self._out.append((self._now_s, BANNER.encode()))
+        self._state = "Alarm" if self._locked else "Idle"
+        if self._locked:
+            self._say("[MSG:'$H'|'$X' to unlock]")
+        if self._stale:
+            self._say("ok")  # to the motion that the alarm cut off
+        if self._locked:
+            return
+        for line in self.startup:
+            self._execute(line)
+            self._say(f">{line}:ok")
+
+    def _go_on(self) -> None:
+        self.planner.go_on(self._now_s)
+        self._state = "Idle" if self.planner.current is None else "Run"
 
     def _line_ready(self) -> bool:
         """Whether a line can be taken: a dwell waits for the end of all motion, and what comes after it waits too."""
-        if b"\n" not in self._buffer or self._state in ("Dead", "Off") or len(self._queue) >= PLANNED:
+        if b"\n" not in self._buffer or self._state in ("Dead", "Off", "Sleep") or self.planner.full:
             return False
-        waits = self._current is not None or self._queue or self._held
-        return not (waits and self._buffer.lstrip()[:2].upper() == b"G4")
+        return not (self.planner.waits and self._buffer.lstrip()[:2].upper() == b"G4")
 
     def _take_line(self) -> None:
         end = self._buffer.index(b"\n")
@@ -199,69 +221,29 @@ class Board:
             return self._dollar(line)
         if self._state in ("Alarm", "Dead"):
             return "error:9"
-        words = _WORD.findall(line)
-        if "".join(a + b for a, b in words) != line:
-            return "error:1" if not line[0].isalpha() else "error:2"
-        return self._gcode([(letter, float(value)) for letter, value in words])
-
-    def _gcode(self, words: list[tuple[str, float]]) -> str:
-        machine, axes, dwell = False, {}, None
-        for letter, value in words:
-            if letter == "G" and value in (0, 1):
-                self._motion = int(value)
-            elif letter == "G" and value in (90, 91):
-                self._absolute = value == 90
-            elif letter == "G" and value == 53:
-                machine = True
-            elif letter == "G" and value == 4:
-                dwell = 0.0
-            elif letter == "G" and value in (21, 94):
-                pass
-            elif letter == "F":
-                self._feed = value / 60.0
-            elif letter == "P" and dwell is not None:
-                dwell = value
-            elif letter in "XYZ":
-                axes[letter] = value
-            else:
-                return "error:20"
-        if dwell is not None:
-            self._dwell_s = self._now_s + dwell + DWELL_EXTRA_S
+        asked = self._interpreter.read(line)
+        if isinstance(asked, Refused):
+            return f"error:{asked.code}"
+        if isinstance(asked, Dwell):
+            self._dwell_s = self._now_s + asked.duration_s + DWELL_EXTRA_S
             return ""
-        return self._plan(axes, self._absolute or machine) if axes else "ok"
+        return "ok" if asked is None else self._move(asked)
 
-    def _plan(self, axes: Mapping[str, float], absolute: bool) -> str:
-        if self._motion == 1 and not self._feed:
-            return "error:22"
-        base = self._planned if self._planned is not None else self.trace.at(self._now_s)
-        x, y, z = (base[i] if a not in axes else axes[a] + (0.0 if absolute else base[i]) for i, a in enumerate("XYZ"))
-        self.motion_lines.append((self._now_s, str(dict(axes))))
+    def _move(self, move: Move) -> str:
+        target = move.target(self.planner.end(self._now_s))
+        self.motion_lines.append((self._now_s, str(dict(move.axes))))
         if self.settings[20] == 1 and not all(
-            -self.settings[130 + i] - 1e-6 <= v <= 1e-6 for i, v in enumerate((x, y, z))
+            -self.settings[130 + i] - 1e-6 <= v <= 1e-6 for i, v in enumerate(target)
         ):
             self.alarm(2, dead=True)
             return ""
-        fastest = min(self.settings[110 + i] for i, a in enumerate("XYZ") if a in axes) / 60.0
-        speed = min(fastest, self._feed or fastest) if self._motion == 1 else fastest
-        self._planned = (x, y, z)
-        self._queue.append(((x, y, z), speed))
-        if self._current is None and self._held is None:
-            self._start_next()
+        if self._state == "Check":
+            return "ok"
+        fastest = min(self.settings[110 + i] for i, a in enumerate("XYZ") if a in move.axes) / 60.0
+        self.planner.add(self._now_s, target, min(fastest, move.feed_mm_s or fastest))
+        if self.planner.current is not None and self._state == "Idle":
+            self._state = "Run"
         return "ok"
-
-    def _start_next(self) -> None:
-        if not self._queue:
-            self._planned = None
-            if self._state in ("Run", "Jog"):
-                self._state = "Idle"
-            return
-        self._current = target, speed = self._queue.popleft()
-        self._state = "Run"
-        self.trace.move(self._now_s + FIRST_STEP_S, target, self._true_speed(speed), self.settings[120])
-
-    def _true_speed(self, speed: float) -> float:
-        """What the step timer makes of it."""
-        return max(speed * self.override / 100.0, SLOWEST_STEPS_S / self.settings[100])
 
     def _dollar(self, line: str) -> str:
         if line == "$H":
@@ -276,8 +258,9 @@ class Board:
             for number, value in sorted(self.settings.items()):
                 self._say(f"${number}={value:.3f}" if number >= 24 else f"${number}={value:g}")
             return "ok"
-        if line == "$X":
-            self._state = "Idle" if self._state == "Alarm" else self._state
+        if line in ("$X", "$C", "$SLP"):
+            before, after = {"$X": ("Alarm", "Idle"), "$C": ("Idle", "Check"), "$SLP": ("Idle", "Sleep")}[line]
+            self._state = after if self._state == before else self._state
             return "ok"
         if line.startswith("$J="):
             return "error:15" if self.settings[20] == 1 else "ok"
@@ -304,56 +287,52 @@ class Board:
         self._say("ok")
 
     def _realtime(self, byte: bytes) -> None:
+        forgotten = self._state == "Dead" and self._now_s < self._deaf_s
         if byte == b"\x18":
-            self._reset()
+            self._reset() if not forgotten else None
         elif self._homing is not None or self._state == "Dead" or self._now_s < self._deaf_s:
             return
         elif byte == b"?":
             self._report()
-        elif byte == b"!" and self._state in ("Run", "Idle", "Jog"):
-            self._hold()
-        elif byte == b"~" and self._state == "Hold:0":
-            self._state = "Run"
-            if self._held is not None:
-                self._queue.appendleft(self._held)
-                self._held = None
-            self._start_next()
+        elif byte in b"!\x84":
+            self._hold("Hold" if byte == b"!" else "Door")
+        elif byte == b"~" and self._state in ("Hold:0", "Door:0"):
+            self._go_on()
         elif byte in b"\x90\x91\x92\x93\x94":
             step = {0x90: 100 - self.override, 0x91: 10, 0x92: -10, 0x93: 1, 0x94: -1}[byte[0]]
             self.override = min(200, max(10, self.override + step))
 
-    def _hold(self) -> None:
-        if self._current is None:
-            self._state = "Hold:0"
+    def _hold(self, state: str) -> None:
+        if self._state not in ("Run", "Idle", "Jog"):
             return
-        self._held, self._current = self._current, None
-        self.trace.stop(self._now_s, self.settings[120])
-        self._state = "Hold:1"
+        if state == "Door":
+            self._say("[MSG:Check Door]")
+        moving = self.planner.hold(self._now_s)
+        self._state = state + (":0" if not moving else ":1" if state == "Hold" else ":2")
 
     def _reset(self) -> None:
-        moving = self.trace.speed_at(self._now_s) > 0 or (self._current is not None and self._state == "Run")
-        if self._homing is not None:
-            self.alarm(6, dead=False)
-        elif moving:
-            self.alarm(3, dead=False)
-        locked, dead = self._state in ("Alarm", "Dead"), self._state == "Dead"
-        self._clear()
-        self._state = "Alarm" if (locked and self.settings[22] == 1) or moving else "Idle"
-        self._out.append((self._now_s + 0.01, BANNER.encode()))
-        if self._state == "Alarm":
-            self._out.append((self._now_s + 0.011, b"[MSG:'$H'|'$X' to unlock]\r\n"))
-        if dead:
-            self._out.append((self._now_s + 0.02, b"ok\r\n"))  # to the motion that the alarm cut off
+        """Locked after it if it was before, or if it cut a motion off: then the board blocks first."""
+        locked, dead = self._state in ("Alarm", "Dead", "Sleep"), self._state == "Dead"
+        moving = self.trace.speed_at(self._now_s) > 0 or (self.planner.current is not None and self._state == "Run")
+        cut = self._homing is not None or moving
+        if cut:
+            self.alarm(6 if self._homing is not None else 3, dead=False)
+        self._restart(ALARM_S if cut else RESTART_S, locked=locked or cut)
+        self._stale = dead
 
     def _report(self) -> None:
         at = self._now_s + LATCH_S
         steps = self.settings[100]
-        x, y, z = (round(v * steps) / steps for v in self.trace.at(at))
-        speed = 60.0 * self.trace.speed_at(at)
-        text = f"<{self._state}|MPos:{x:.3f},{y:.3f},{z:.3f}|FS:{speed:.0f},0|Ov:{self.override},100,100>\r\n"
-        self._out.append((self._now_s + TELL_S, text.encode()))
+        seen = Seen(
+            state=self._state,
+            position_mm=tuple(round(v * steps) / steps for v in self.trace.at(at)),
+            speed_mm_s=self.trace.speed_at(at),
+            room=(self.planner.room, BUFFER - len(self._buffer)),
+            override=self.override,
+        )
+        self._out.append((self._now_s + TELL_S, f"{self._reports.line(seen, int(self.settings[10]))}\r\n".encode()))
 
-    def _say(self, text: str) -> None:
+    def _say(self, text: str, at_s: float | None = None) -> None:
         # Lines leave in order, each after the ones before it.
         last = self._out[-1][0] if self._out else self._now_s
-        self._out.append((max(self._now_s, last), f"{text}\r\n".encode()))
+        self._out.append((max(self._now_s if at_s is None else at_s, last), f"{text}\r\n".encode()))

@@ -10,7 +10,7 @@ from reflectsep.errors import CameraError
 from reflectsep.rig.clock import Clock, HostClock
 from reflectsep.rig.command import checked_arguments, run_command
 from reflectsep.rig.devices import CameraLimits, ClockReading, RawFrame
-from reflectsep.rig.still import StillCamera
+from reflectsep.rig.still import StillCamera, scratch_folder
 
 
 class CommandCamera(StillCamera):
@@ -24,6 +24,7 @@ class CommandCamera(StillCamera):
         exposure_s: Shortest and longest; None: the exposure is not the program's to set.
         timeout_s: For a picture.
         clock: The session's.
+        scratch: Folder for the files until they are taken over; None: the system's.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class CommandCamera(StillCamera):
         exposure_s: Sequence[float] | None = None,
         timeout_s: float = 30.0,
         clock: Clock | None = None,
+        scratch: Path | None = None,
     ) -> None:
         where = "rig.devices.camera"
         self._take = checked_arguments(take, f"{where}.take")
@@ -42,6 +44,7 @@ class CommandCamera(StillCamera):
         self._suffix, self._timeout_s = suffix, timeout_s
         self._bounds = None if exposure_s is None else (float(exposure_s[0]), float(exposure_s[1]))
         self._clock = clock or HostClock()
+        self._scratch = scratch
         self._wanted_s: float | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._count = 0
@@ -58,7 +61,7 @@ class CommandCamera(StillCamera):
 
     def connect(self) -> None:
         """A folder for the files, apart from the session's."""
-        self._folder = tempfile.TemporaryDirectory(prefix="reflectsep-camera-")
+        self._folder = scratch_folder(self._scratch)
 
     def set_exposure(self, exposure_s: float) -> float | None:
         """Hand it to the next call."""

@@ -92,6 +92,13 @@ class FolderCamera:
         while not deadline.passed:
             frames += self._whole()
             self._clock.sleep(LOOK_S)
+        for name, (_, _, first_s) in sorted(self._sizes.items()):
+            self._seen.add(name)
+            number = _number(Path(name).stem)
+            frames.append(
+                RawFrame(pixels=None, sequence=number, host_time_s=first_s, fault=f"{name} stayed half-written")
+            )
+        self._sizes.clear()
         return frames
 
     def close(self) -> None:

@@ -18,9 +18,11 @@ from reflectsep.errors import CameraError, MissingExtraError
 from reflectsep.io.pictures import SUFFIXES
 from reflectsep.rig.clock import Clock, HostClock
 from reflectsep.rig.devices import CameraLimits, RawFrame
-from reflectsep.rig.still import StillCamera
+from reflectsep.rig.still import StillCamera, scratch_folder
 
 SHUTTER = ("shutterspeed", "shutterspeed2", "exptime")
+NO_ROOM = (-3, -115)
+"""GP_ERROR_NO_MEMORY, which is how a store that is full is told over PTP, and GP_ERROR_NO_SPACE."""
 KEPT = ("iso", "f-number", "aperture", "imageformat", "imagequality", "imagesize", "whitebalance", "serialnumber")
 """Settings that a session must not find changed when it goes on."""
 
@@ -33,6 +35,7 @@ class Gphoto2Camera(StillCamera):
         settings: Set when connecting, e.g. `iso: "100"`.
         delete: Take each picture off the card once it has been fetched, so that the card does not fill.
         clock: The session's.
+        scratch: Folder for the files until they are taken over; None: the system's.
     """
 
     def __init__(
@@ -42,9 +45,11 @@ class Gphoto2Camera(StillCamera):
         settings: Mapping[str, str] | None = None,
         delete: bool = True,
         clock: Clock | None = None,
+        scratch: Path | None = None,
     ) -> None:
         self._model, self._settings, self._delete = model, dict(settings or {}), delete
         self._clock = clock or HostClock()
+        self._scratch = scratch
         self._gp: Any = None
         self._camera: Any = None
         self._shutter: str | None = None
@@ -67,7 +72,54 @@ class Gphoto2Camera(StillCamera):
     def connect(self) -> None:
         """Find it and read what it can do."""
         self._gp = _library()
-        self._folder = tempfile.TemporaryDirectory(prefix="reflectsep-camera-")
+        try:
+            self._find()
+        except BaseException:
+            self.close()
+            raise
+
+    def set_exposure(self, exposure_s: float) -> float | None:
+        """The nearest of the camera's own choices; what it says then."""
+        if not self._choices or self._shutter is None:
+            return None
+        nearest = min(self._choices, key=lambda text: abs(math.log(self._choices[text] / exposure_s)))
+        self._set(self._shutter, nearest)
+        return self.read_exposure()
+
+    def read_exposure(self) -> float | None:
+        """As the camera says; None where that is no time."""
+        said = self._get(self._shutter) if self._shutter else None
+        return None if said is None else shutter_time(said)
+
+    def snap(self, name: str) -> RawFrame:  # noqa: ARG002
+        """Take one, fetch it, and take it off the card."""
+        if self._camera is None or self._folder is None:
+            raise CameraError("camera: not connected")
+        with _Errors(self._gp, "the camera took no picture"):
+            taken = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
+        suffix = Path(taken.name).suffix.lower()
+        if suffix not in SUFFIXES:
+            raise CameraError(f"the camera gave {taken.name}; set it to one of {' '.join(SUFFIXES)}")
+        file = Path(self._folder.name) / f"{self._count:06d}{suffix}"
+        self._count += 1
+        with _Errors(self._gp, f"{taken.name} cannot be fetched"):
+            got = self._camera.file_get(taken.folder, taken.name, self._gp.GP_FILE_TYPE_NORMAL)
+            got.save(str(file))
+            if self._delete:
+                self._camera.file_delete(taken.folder, taken.name)
+        return RawFrame(pixels=None, file=file, host_time_s=self._clock.now())
+
+    def close(self) -> None:
+        """Let go of it."""
+        with suppress(Exception):
+            self._camera.exit()
+        self._camera = None
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+    def _find(self) -> None:
+        self._folder = scratch_folder(self._scratch)
         with _Errors(self._gp, f"camera {self._model or '(any)'}"):
             self._camera = self._gp.Camera()
             self._camera.init()
@@ -83,48 +135,10 @@ class Gphoto2Camera(StillCamera):
             value = self._get(name)
             if value is not None:
                 self._identity[name] = value
+            if value is not None and name in ("imageformat", "imagequality") and "+" in value:
+                raise CameraError(f"{model}: {name}={value}: two files a picture; set one, raw or JPEG")
         self._shutter = next((name for name in SHUTTER if self._get(name) is not None), None)
         self._choices = self._times() if self._shutter else {}
-
-    def set_exposure(self, exposure_s: float) -> float | None:
-        """The nearest of the camera's own choices; what it says then."""
-        if not self._choices or self._shutter is None:
-            return None
-        nearest = min(self._choices, key=lambda text: abs(math.log(self._choices[text] / exposure_s)))
-        self._set(self._shutter, nearest)
-        return self.read_exposure()
-
-    def read_exposure(self) -> float | None:
-        """As the camera says; None where that is no time."""
-        said = self._get(self._shutter) if self._shutter else None
-        return None if said is None else shutter_time(said)
-
-    def snap(self, name: str) -> RawFrame:
-        """Take one, fetch it, and take it off the card."""
-        if self._camera is None or self._folder is None:
-            raise CameraError("camera: not connected")
-        with _Errors(self._gp, f"{name}: the camera took no picture (is its card full?)"):
-            taken = self._camera.capture(self._gp.GP_CAPTURE_IMAGE)
-        suffix = Path(taken.name).suffix.lower()
-        if suffix not in SUFFIXES:
-            raise CameraError(f"{name}: the camera gave {taken.name}; set it to one of {' '.join(SUFFIXES)}")
-        file = Path(self._folder.name) / f"{self._count:06d}{suffix}"
-        self._count += 1
-        with _Errors(self._gp, f"{name}: {taken.name} cannot be fetched"):
-            got = self._camera.file_get(taken.folder, taken.name, self._gp.GP_FILE_TYPE_NORMAL)
-            got.save(str(file))
-            if self._delete:
-                self._camera.file_delete(taken.folder, taken.name)
-        return RawFrame(pixels=None, file=file, host_time_s=self._clock.now())
-
-    def close(self) -> None:
-        """Let go of it."""
-        with suppress(Exception):
-            self._camera.exit()
-        self._camera = None
-        if self._folder is not None:
-            self._folder.cleanup()
-            self._folder = None
 
     def _times(self) -> dict[str, float]:
         with _Errors(self._gp, "shutter speeds"):
@@ -167,7 +181,8 @@ class _Errors:
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
         if isinstance(error, self._gp.GPhoto2Error):
-            raise CameraError(f"{self._what}: {' '.join(str(error).split())}") from error
+            said = "its card is full" if error.code in NO_ROOM else " ".join(str(error).split())
+            raise CameraError(f"{self._what}: {said}") from error
 
 
 def shutter_time(text: str) -> float | None:

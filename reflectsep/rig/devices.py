@@ -110,11 +110,15 @@ class Stage(Protocol):
         """
         ...
 
-    def halt(self) -> str:
+    def position(self, axis: Axis) -> float | None:
+        """Where the controller said that the last motion along an axis ended, mm; None: it has not said."""
+        ...
+
+    def halt(self) -> str | None:
         """Stop, keeping the position where that is possible; never raises.
 
         Returns:
-            What is known of the stage now, for a person.
+            What is known of the stage now, for a person; None: it was not connected.
         """
         ...
 

@@ -14,7 +14,7 @@ from reflectsep.errors import SessionError
 from reflectsep.io.capture import write_manifest
 from reflectsep.io.pictures import read_picture, write_picture
 from reflectsep.rig.plan import Plan, SlabSweep, Still
-from reflectsep.rig.session import Session
+from reflectsep.rig.session import Session, unwritable
 
 OBJECT_SHARE = 0.02
 """Of the brightest 0.1 %: what any light raises above this over the dark picture is the object."""
@@ -24,8 +24,15 @@ def finish(session: Session, plan: Plan) -> Capture:
     """Write the capture of a session.
 
     Raises:
-        SessionError: a step is not done, or there is no object to be seen.
+        SessionError: a step is not done, there is no object to be seen, or the folder cannot be written.
     """
+    try:
+        return _finish(session, plan)
+    except OSError as error:
+        raise unwritable(session.folder, error) from error
+
+
+def _finish(session: Session, plan: Plan) -> Capture:
     records: dict[str, Mapping[str, Any]] = {}
     for shot in plan.shots:
         record = session.step(shot.name)

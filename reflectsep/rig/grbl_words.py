@@ -13,8 +13,11 @@ ERRORS = {
     8: "only possible while it stands still",
     9: "locked after an alarm or at boot: home it",
     11: "the line is too long",
+    13: "the safety door is open",
+    14: "the line is too long for its memory",
     15: "the jog leaves the travel",
     20: "no such command",
+    21: "two commands of one group in a line",
     22: "no feed rate was given",
 }
 ALARMS = {
@@ -46,7 +49,7 @@ def parse_status(line: str) -> Status | None:
     if match is None or match[2] != "M":
         return None
     numbers = match[3].split(",")
-    if len(numbers) != 3 or not all(_NUMBER.fullmatch(number) for number in numbers):
+    if not 3 <= len(numbers) <= 6 or not all(_NUMBER.fullmatch(number) for number in numbers):
         return None
     override = None
     for part in match[4].split("|"):
@@ -55,7 +58,7 @@ def parse_status(line: str) -> Status | None:
             if not first.isdigit():
                 return None
             override = float(first)
-    x, y, z = (float(number) for number in numbers)
+    x, y, z = (float(number) for number in numbers[:3])  # boards with a fourth axis tell it behind
     return Status(state=match[1], position_mm=(x, y, z), override_percent=override)
 
 

@@ -6,6 +6,7 @@ OSError from `in_waiting` and as termios.error, which is no OSError, from `flush
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -90,9 +91,10 @@ class SerialLink:
             line = self._taken()
             if line is not None:
                 return line
-            if deadline.passed:
+            if not deadline.passed:
+                self._receive()
+            elif not self._came():
                 return None
-            self._receive()
 
     def drop_input(self) -> None:
         """Forget what has come so far.
@@ -132,6 +134,14 @@ class SerialLink:
             waiting = self._line.in_waiting
             self._bytes += self._line.read(min(max(1, waiting), 4096))
 
+    def _came(self) -> bool:
+        """Take what has come, without waiting: a host that was asleep at the deadline still has it."""
+        with self._lost("reading"):
+            waiting = self._line.in_waiting
+            got = self._line.read(min(waiting, 4096)) if waiting else b""
+        self._bytes += got
+        return bool(got)
+
     @contextmanager
     def _lost(self, doing: str) -> Iterator[None]:
         if self._line is None:
@@ -144,6 +154,9 @@ class SerialLink:
 
 
 def _reason(error: BaseException) -> str:
+    number = getattr(error, "errno", None)
+    if isinstance(number, int) and number > 0:
+        return os.strerror(number)  # pyserial repeats itself around it
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -57,6 +57,7 @@ class MarlinStage:
         self._identity: dict[str, str] = {}
         self._known = False
         self._failed: str | None = None
+        self._arrived: dict[Axis, float] = {}
         self._still()
 
     def _still(self) -> None:
@@ -109,6 +110,7 @@ class MarlinStage:
         """`G28` of the axes in use."""
         self._refuse_failed()
         self._known = False
+        self._arrived.clear()
         self._command("G28 " + " ".join(axis.letter for axis in self._axes.values()), self._homing_s)
         self._known = True
 
@@ -144,6 +146,7 @@ class MarlinStage:
         if abs(position - target_mm) <= 1.5 * self.limits[axis].step_mm + 0.005 and after >= self._due_s:
             self._command("M400", self._command_s)
             self._known, self._end = True, None
+            self._arrived[axis] = position
         elif self._end.passed:
             self._end = None
             raise StageError(f"{self._link.port}: no end of the motion in time; its position is unknown")
@@ -155,10 +158,14 @@ class MarlinStage:
             override_percent=None,
         )
 
-    def halt(self) -> str:
+    def position(self, axis: Axis) -> float | None:
+        """As reported last at the end of a motion along it."""
+        return self._arrived.get(axis) if self._known else None
+
+    def halt(self) -> str | None:
         """`M410`: brake; the position is lost."""
         if not self._link.is_open:
-            return "the stage is not connected"
+            return None
         self._known, self._end = False, None
         try:
             self._link.write(b"M410\n")

@@ -131,7 +131,7 @@ def check_plan(plan: Plan, limits: Mapping[Axis, AxisLimits]) -> None:
             which = (
                 f"below {slowest:.4g} mm/s its motor steps too slowly for the controller to keep time"
                 if speed < slowest
-                else f"it reaches {fastest:g} mm/s"
+                else f"the stage reaches {fastest:g} mm/s at most"
             )
             raise SettingsError(f"{where}: rig.sweep.speed_mm_s={speed:g}: {which}")
         if not sweep.start_mm < sweep.end_mm:

@@ -16,9 +16,10 @@ from reflectsep.io.exr import write_channels
 from reflectsep.progress import Progress, silent
 from reflectsep.rig.clock import Clock, HostClock
 from reflectsep.rig.devices import Axis, Devices, RawFrame
-from reflectsep.rig.exposure import Brightness, brightness, find_exposure, warning
+from reflectsep.rig.exposure import Brightness, brightness, warning
 from reflectsep.rig.frames import FrameStore
 from reflectsep.rig.guard import Guard, Interrupted
+from reflectsep.rig.metering import find_exposures
 from reflectsep.rig.plan import Exposure, Plan, SlabSweep, Still, check_plan, estimate
 from reflectsep.rig.session import Session
 from reflectsep.rig.sweep import SweepOptions, take_sweep
@@ -87,7 +88,7 @@ class Runner:
             Interrupted: somebody stopped it.
         """
         check_plan(self.plan, self.devices.stage.limits)
-        self._check_space()
+        self._check_space(self.options.frame_bytes)
         with Guard(self.devices.stage.abort) as guard:
             try:
                 self._connect()
@@ -114,13 +115,14 @@ class Runner:
         if self._warned <= WARNINGS_A_STEP:
             self._tell(text)
 
-    def move(self, axis: Axis, target_mm: float) -> None:
-        """Go somewhere as fast as the stage may, and wait for the end."""
+    def move(self, axis: Axis, target_mm: float) -> float | None:
+        """Go somewhere as fast as the stage may, and wait for the end; where the stage says that it is then."""
         stage = self.devices.stage
         stage.begin(axis, target_mm, stage.limits[axis].speed_mm_s[1])
         while stage.moving:
             stage.poll()
             self.clock.sleep(IDLE_S)
+        return stage.position(axis)
 
     def set_exposure(self, kind: Exposure) -> float | None:
         """Set the exposure of a kind of picture; what the camera says it is."""
@@ -130,10 +132,28 @@ class Runner:
             self.warn(f"the camera made {actual:g} s of an exposure of {wanted:g} s; recorded as {actual:g} s")
         return actual
 
+    def begin_step(self, name: str) -> Path:
+        """A step of another name begins: warnings count anew; returns the folder for its files."""
+        self._step, self._warned = name, 0
+        return self.session.begin_step(name)
+
+    def say(self, text: str) -> None:
+        """Tell the person at the rig."""
+        self._tell(text)
+
     def switch(self, light: str | None) -> None:
         """One light on, or none."""
         said = self.devices.lights.switch(light)
         self.session.event("light", asked=light or "off", read_back=said)
+
+    def snap(self, name: str) -> RawFrame:
+        """One picture; errors say which."""
+        try:
+            return self.devices.camera.snap(name)
+        except CameraError as error:
+            if name in str(error):
+                raise
+            raise CameraError(f"{name}: {error}") from error
 
     def look(self, what: str, seen: Brightness, exposure_s: float | None, *, slab: bool) -> None:
         """Warn where a picture is clipped or too dark."""
@@ -141,12 +161,12 @@ class Runner:
         if text is not None:
             self.warn(text)
 
-    def _check_space(self) -> None:
-        wanted = SPACE_SPARE * estimate(self.plan, self.devices.stage.limits, self.options.frame_bytes).bytes
+    def _check_space(self, frame_bytes: int) -> None:
+        wanted = SPACE_SPARE * estimate(self.plan, self.devices.stage.limits, frame_bytes).bytes
         free = shutil.disk_usage(self.session.folder).free
         if wanted > free:
             raise SessionError(
-                f"{self.session.folder}: {free / 1e6:.0f} MB are free, up to {wanted / 1e6:.0f} MB are needed"
+                f"{self.session.folder}: {free / 1e6:.4g} MB are free, up to {wanted / 1e6:.4g} MB are needed"
             )
 
     def _connect(self) -> None:
@@ -171,7 +191,9 @@ class Runner:
                 "switch the stage off and on, and say zeroed=true"
             )
         self.session.event("connected")
+        self._progress("homing", 0, 1)
         stage.home()
+        self._progress("homing", 1, 1)
         self.session.remember("homed", True)
         self.session.event("homed", by="switches" if stage.homes else "hand")
 
@@ -179,13 +201,16 @@ class Runner:
         shots = self.plan.shots
         total = sum(shot.frames if isinstance(shot, SlabSweep) else 1 for shot in shots)
         done = 0
-        self._find_exposures()
+        self._exposures = find_exposures(self)
         for shot in shots:
             self._progress("capture", done, total)
             self._step, self._warned = shot.name, 0
             record = self.session.step(shot.name)
             if record is None:
                 record = self._take(shot, lambda got, before=done: self._progress("capture", before + got, total))
+                if done == 0:
+                    # What a picture takes is known now, as it is not of every camera before.
+                    self._check_space(max((self.session.folder / name).stat().st_size for name in record["files"]))
             self.size = tuple(record["size"]) if self.size is None else self.size
             done += shot.frames if isinstance(shot, SlabSweep) else 1
         self._step = "end"
@@ -217,7 +242,7 @@ class Runner:
         exposure = self.set_exposure(shot.exposure)
         pictures = []
         for index in range(shot.frames):
-            values = store.add(self._whole(shot.name if shot.frames == 1 else f"{shot.name}/{index}"))
+            values = store.add(self.whole(shot.name if shot.frames == 1 else f"{shot.name}/{index}"))
             if values is None:
                 raise CameraError(f"{shot.name}: {store.stored[-1].fault}")
             pictures.append(values)
@@ -233,63 +258,21 @@ class Runner:
         write_channels(path, dict(zip("Y" if len(planes) == 1 else "RGB", planes, strict=True)))
         return {f"{shot.name}.exr": path}, {"exposure_s": exposure, "averaged": shot.frames}
 
-    def _whole(self, name: str) -> RawFrame:
+    def whole(self, name: str) -> RawFrame:
         """A picture, tried again where it came damaged."""
         for _ in range(TRIES - 1):
-            frame = self.devices.camera.snap(name)
+            frame = self.snap(name)
             if frame.fault is None:
                 return frame
             self.warn(f"{name}: {frame.fault}; taken again")
-        return self.devices.camera.snap(name)
-
-    def _find_exposures(self) -> None:
-        """Exposures of the plan, those of an earlier part of this session, or by test pictures."""
-        found = self.session.recall("exposures") or {}
-        for kind, given in self.plan.exposure_s.items():
-            if given is not None:
-                self._exposures[kind] = given
-            elif kind in found:
-                self._exposures[kind] = found[kind]
-            elif kind == "full" or self.plan.sweeps:
-                self._step = f"exposure-{kind}"
-                self._exposures[kind] = self._by_tests(kind)
-                found[kind] = self._exposures[kind]
-                self.session.remember("exposures", found)
-                self._tell(f"exposure of {kind} pictures: {found[kind]:.4g} s")
-
-    def _by_tests(self, kind: Exposure) -> float:
-        """One exposure for all lights: the shortest that any of them needs."""
-        bounds = self.devices.camera.limits.exposure_s
-        if bounds is None:
-            raise CameraError(f"the exposure of this camera cannot be set: give rig.{kind}_exposure_s")
-        lights = [still.light for still in self.plan.stills if still.kind == "full"]
-        if kind == "slab":
-            sweeps = self.plan.sweeps
-            lights = list(dict.fromkeys(sweep.light for sweep in sweeps))
-            bounds = (bounds[0], min(bounds[1], *(0.9 / s.rate_hz for s in sweeps if s.motion == "continuous"), 1e3))
-            self.move(sweeps[0].axis, (sweeps[0].start_mm + sweeps[0].end_mm) / 2)
-        else:
-            self.move("x", self.plan.park_mm)
-        chosen = []
-        for light in lights:
-            self.switch(light)
-            chosen.append(find_exposure(lambda s: self._test(kind, s), chosen[-1] if chosen else 0.01, bounds))
-        self.switch(None)
-        return min(chosen)
-
-    def _test(self, kind: str, exposure_s: float) -> tuple[float | None, np.ndarray]:
-        actual = self.devices.camera.set_exposure(exposure_s)
-        store = FrameStore(self.session, self.session.begin_step(f"test-{kind}"), None)
-        values = store.add(self._whole(f"test-{kind}"))
-        if values is None:
-            raise CameraError(f"test picture: {store.stored[-1].fault}")
-        return actual, values
+        return self.snap(name)
 
     def _fail(self, error: BaseException) -> None:
         """Stop everything, then write down what happened; nothing here raises."""
         with suppress(Exception):
             state = self.devices.stage.halt()
-            self._tell(f"{self._step}: stopped: {state}")
+            if state is not None:
+                self._tell(f"{self._step}: stopped: {state}; resume=true goes on from this step")
             with suppress(Exception):
                 self.session.event("failed", step=self._step, error=f"{type(error).__name__}: {error}", stage=state)
         with suppress(Exception):

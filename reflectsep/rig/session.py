@@ -53,22 +53,25 @@ class Session:
         """Take the folder: make it, or go on with what is in it.
 
         Raises:
-            SessionError: in use, not a session of ours, an unfinished one without `resume`, or a damaged manifest.
+            SessionError: in use, not a session of ours, an unfinished one without `resume`, a damaged manifest, or a
+                folder that cannot be written.
         """
         if not resume and self.exists:
             done = len(self._read()["steps"])
             raise SessionError(f"{self.folder}: holds a session with {done} steps done; say resume=true to go on")
         if self.folder.is_dir() and any(self.folder.iterdir()) and not self.exists and not self._only_ours():
             raise SessionError(f"{self.folder}: not empty, and no {MANIFEST} in it: choose another folder")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._take_lock()
         try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._take_lock()
             for leftover in self.folder.glob(".*.part*"):
-                leftover.unlink()
+                shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
             self._open_log()
             self._document = self._read() if self.exists else {"format": FORMAT, "steps": {}}
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if isinstance(error, OSError):
+                raise unwritable(self.folder, error) from error
             raise
 
     def close(self) -> None:
@@ -181,7 +184,8 @@ class Session:
 
     def _only_ours(self) -> bool:
         """Whether a session was killed in this folder before its first manifest."""
-        return {p.name for p in self.folder.iterdir() if not p.name.endswith(".part.json")} <= {EVENTS, LOCK}
+        names = {p.name for p in self.folder.iterdir() if not (p.name.startswith(".") and ".part" in p.name)}
+        return names <= {EVENTS, LOCK}
 
     def _take_lock(self) -> None:
         import fcntl
@@ -206,6 +210,11 @@ class Session:
         if size and os.pread(self._log, 1, size - 1) != b"\n":
             os.write(self._log, b"\n")  # a line that a crash cut off stays alone on its line
             self.event("torn line")
+
+
+def unwritable(folder: Path, error: OSError) -> SessionError:
+    """The error of a session whose folder cannot be written, or no longer."""
+    return SessionError(f"{folder}: cannot be written: {error.strerror or error}")
 
 
 def read_events(folder: Path | str) -> list[dict[str, Any]]:

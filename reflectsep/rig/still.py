@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from reflectsep.errors import CameraError
@@ -31,3 +33,8 @@ class StillCamera:
     def read_clock(self) -> ClockReading | None:
         """It has no clock that frames are marked with."""
         return None
+
+
+def scratch_folder(parent: Path | None) -> tempfile.TemporaryDirectory[str]:
+    """A folder for pictures until they are taken over; in a session's folder, what a crash left of it is swept away."""
+    return tempfile.TemporaryDirectory(prefix=".camera.", suffix=".part", dir=parent)

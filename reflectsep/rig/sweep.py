@@ -195,7 +195,7 @@ def _assemble(
     track = fit_track(recording.reports, (first + ramp, last - ramp), shot.speed_mm_s, limits.step_mm)
     camera = runner.devices.camera.limits
     slots = row(store.stored, first=camera.sequence_first, last=camera.sequence_last, period_s=1.0 / shot.rate_hz)
-    clock = _camera_clock(recording, store, options.latency_s)
+    clock = _camera_clock(shot, recording, store, options.latency_s)
     placed = place(np.array([slot.time_s for slot in slots]), clock, track, limits.step_mm)
     tolerance = 1e-6
     kept = np.flatnonzero(
@@ -231,12 +231,17 @@ def _moves(shot: SlabSweep, chosen: list[Slot], facts: dict[str, Any]) -> Taken:
     return moves, facts
 
 
-def _camera_clock(recording: Recording, store: FrameStore, latency_s: float) -> Line:
+def _camera_clock(shot: SlabSweep, recording: Recording, store: FrameStore, latency_s: float) -> Line:
     """Host time of the frames' times."""
     if recording.off_s > recording.on_s:
         whole = [s for s in store.stored if s.level is not None and s.device_time_s is not None]
         times, levels = np.array([s.device_time_s for s in whole]), np.array([s.level for s in whole])
-        return clock_of_marks(times, levels, Switched(on_s=recording.on_s, off_s=recording.off_s))
+        switched = Switched(on_s=recording.on_s, off_s=recording.off_s)
+        try:
+            return clock_of_marks(times, levels, switched)
+        except CameraError as error:
+            why = next((f" ({s.fault})" for s in store.stored if s.fault), "")
+            raise CameraError(f"{shot.name}: {error}{why}") from error
     if any(frame.device_time_s is not None for frame in recording.frames):
         return fit_clock(recording.frames, recording.readings, latency_s)
     return Line(centre=0.0, value=-latency_s, slope=1.0, value_sd=UNTIMED_SD_S, slope_sd=0.0, rms=UNTIMED_SD_S)
@@ -244,13 +249,12 @@ def _camera_clock(recording: Recording, store: FrameStore, latency_s: float) -> 
 
 def _check_lost(shot: SlabSweep, chosen: list[Slot], store: FrameStore, max_lost: float) -> None:
     lost = sum(slot.file is None for slot in chosen)
-    why = next((s.fault for s in store.stored if s.fault), None)
+    why = next((f" ({s.fault})" for s in store.stored if s.fault), "")
     if len(chosen) < max(2, shot.frames - 2):
-        raise CameraError(f"{shot.name}: {len(chosen)} frames during the sweep, expected {shot.frames}")
+        raise CameraError(f"{shot.name}: {len(chosen)} frames during the sweep, expected {shot.frames}{why}")
     if lost > max_lost * len(chosen):
         raise CameraError(
-            f"{shot.name}: {lost} of {len(chosen)} frames were lost{f' ({why})' if why else ''}, "
-            f"at most {100 * max_lost:g} % may be"
+            f"{shot.name}: {lost} of {len(chosen)} frames were lost{why}, at most {100 * max_lost:g} % may be"
         )
 
 
@@ -263,22 +267,22 @@ def _take_steps(
 ) -> Taken:
     """Frame by frame, the stage standing still for each: the position is what the stage reports at rest."""
     limits = runner.devices.stage.limits[shot.axis]
-    chosen, positions, times = [], [], []
+    chosen: list[Slot] = []
+    positions: list[float | None] = []
     began = runner.clock.now()
     for index in range(shot.frames):
-        target = shot.start_mm + index * shot.step_mm
-        runner.move(shot.axis, target)
-        values = store.add(runner.devices.camera.snap(f"{shot.name}/{index}"))
+        reached = runner.move(shot.axis, shot.start_mm + index * shot.step_mm)
+        values = store.add(runner.snap(f"{shot.name}/{index}"))
         if values is None:
-            raise CameraError(f"{shot.name}, frame {index}: {store.stored[-1].fault}")
+            raise CameraError(f"{shot.name}/{index}: {store.stored[-1].fault}")
         _judge(runner, shot, store, exposure, values)
         chosen.append(Slot(file=store.stored[-1].file, time_s=runner.clock.now() - began))
-        positions.append(target)
-        times.append(runner.clock.now() - began)
+        positions.append(reached)
         progress(index + 1)
     if len(chosen) < 2:
         raise StageError(f"{shot.name}: {len(chosen)} frames; a sweep needs two or more")
     runner.switch(None)
-    facts: dict[str, Any] = {"count": len(chosen), "lost": [], "position_mm": positions, "time_s": times}
+    facts: dict[str, Any] = {"count": len(chosen), "lost": [], "position_mm": positions}
+    facts["time_s"] = [slot.time_s for slot in chosen]
     facts["position_sd_mm"] = [limits.step_mm] * len(chosen)
     return _moves(shot, chosen, facts)

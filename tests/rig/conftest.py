@@ -131,6 +131,7 @@ class Rig:
     told: list = field(default_factory=list)
     exposure: dict = field(default_factory=lambda: {"full": 0.01, "slab": 0.01})
     max_lost: float = 0.1
+    mask: str = "auto"
 
     def __post_init__(self):
         self.change = lambda frame: [frame]
@@ -163,7 +164,7 @@ class Rig:
             park_mm=-1.0,
             exposure_s=self.exposure,
             encoding="linear",
-            mask="auto",
+            mask=self.mask,
             max_lost=self.max_lost,
         )
 
@@ -218,6 +219,8 @@ def record_fault(request):
         if path:
             cells = [fault, seen, state, disk, resumed]
             with open(path, "a") as table:
+                if table.tell() == 0:
+                    table.write("| fault | what is seen | the rig | on disk | resume |\n|---|---|---|---|---|\n")
                 table.write("| " + " | ".join(str(cell).replace("|", "/") for cell in cells) + " |\n")
 
     return record

@@ -26,6 +26,8 @@ class Firmware:
         self.port = os.ttyname(self._slave)
         self.eat = []
         self.frozen = False
+        self.late_s = 0.0
+        """By how much, at worst, it was kept from running: a board in earnest has its processor for itself."""
         self._plugged = True
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -57,7 +59,10 @@ class Firmware:
             return self.board.position(time_s)
 
     def _run(self):
+        awake_s = time.monotonic()
         while self._plugged:
+            self.late_s = max(self.late_s, time.monotonic() - awake_s - TICK_S)
+            awake_s = time.monotonic()
             ready, _, _ = select.select([self._master], [], [], TICK_S)
             data = os.read(self._master, 4096) if ready else b""
             now = time.monotonic()

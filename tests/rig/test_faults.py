@@ -9,14 +9,17 @@ import json
 import re
 import signal
 import termios
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import serial
 
 from reflectsep.errors import ReflectsepError, SettingsError
+from reflectsep.rig import runner as runner_module
 from reflectsep.rig import session as session_module
 from reflectsep.rig.backends import build
+from reflectsep.rig.devices import RawFrame
 from reflectsep.rig.session import Session, read_events
 
 from .conftest import NAMES, complete, whole
@@ -76,13 +79,13 @@ def press(*signals):
 
 def press_twice(rig, monkeypatch):
     stage = rig.devices.stage
-    held = stage._held
+    held = stage._board.hold
 
     def again():
         signal.raise_signal(signal.SIGINT)
         return held()
 
-    monkeypatch.setattr(stage, "_held", again)
+    monkeypatch.setattr(stage._board, "hold", again)
     at_sweep(rig, MOVING, lambda: signal.raise_signal(signal.SIGINT))
 
 
@@ -243,14 +246,14 @@ def never_homed(rig, monkeypatch):
 
 def refused(answer):
     def inject(rig, monkeypatch):
-        plan = rig.bench.board._plan
+        move = rig.bench.board._move
         sent = []
 
-        def deny(axes, absolute):
+        def deny(asked):
             sent.append(1)
-            return answer if len(sent) > 6 else plan(axes, absolute)
+            return answer if len(sent) > 6 else move(asked)
 
-        monkeypatch.setattr(rig.bench.board, "_plan", deny)
+        monkeypatch.setattr(rig.bench.board, "_move", deny)
 
     return inject
 
@@ -288,7 +291,8 @@ FAULTS = {
         "was refused: error:1",
         "safe",
     ),
-    "feed hold by hand": (send(b"!"), "no end of the motion in time", "safe"),
+    "feed hold by hand": (send(b"!"), "is in state Hold:. in the middle of a motion", "safe"),
+    "safety door opened": (send(b"\x84"), "is in state Door:. in the middle of a motion", "safe"),
     "Ctrl-C once": (press(signal.SIGINT), "SIGINT", "safe"),
     "Ctrl-C twice": (press_twice, "SIGINT", "safe"),
     "Ctrl-C while an error is handled": (press_while_stopping, "no longer there", "safe"),
@@ -319,6 +323,7 @@ def test_fault_stops_the_rig_keeps_the_disk_whole_and_is_resumed(fault, rig_in, 
     assert re.search(words, told), told
     assert "\n" not in str(caught.value)
     assert rig.bench.light is None
+    assert all(text.endswith("resume=true goes on from this step") for text in rig.told if ": stopped: " in text)
     motions = len(rig.bench.board.motion_lines)
     if state == "safe":
         assert rig.at_rest()
@@ -357,7 +362,7 @@ def reorder(rig, monkeypatch):
 
 
 SURVIVED = {
-    "nothing": lambda rig, m: None,
+    "no fault": lambda rig, m: None,
     "noise and partial lines from the board": bend,
     "duplicate frames": lambda rig, m: setattr(rig, "change", lambda frame: [frame, frame]),
     "reordered frames": reorder,
@@ -392,17 +397,18 @@ def test_few_lost_frames_stay_lost_and_null(rig_in, record_fault):
     record_fault("a dropped frame", "nothing", "done", "null in the manifest", "not needed")
 
 
-def test_commands_before_the_banner_vanish_and_are_not_relied_on(rig_in):
+def test_commands_before_the_banner_vanish_and_are_not_relied_on(rig_in, record_fault):
     rig = rig_in()
     rig.run()
     assert rig.bench.board.motion_lines[0][0] > 1.0
+    record_fault("commands before the banner", "nothing", "waits for the banner", "complete", "not needed")
 
 
 @pytest.mark.parametrize(
     ("sweep", "settings", "words"),
     [
         ({"speed_mm_s": 0.1}, {}, "below 0.124 mm/s its motor steps too slowly"),
-        ({"speed_mm_s": 60.0}, {}, "it reaches 50 mm/s"),
+        ({"speed_mm_s": 60.0}, {}, "the stage reaches 50 mm/s"),
         ({"start_mm": -199.9}, {}, "with its run-up from -200.950 to"),
         ({"end_mm": -69.0}, {}, "its speed cannot be checked"),
         ({}, {110: 1000.0}, "is 16.6667 mm/s, less than max_speed_mm_s=50"),
@@ -422,7 +428,7 @@ def test_what_the_stage_cannot_do_is_refused_before_anything_moves(sweep, settin
 
 def test_a_slow_sweep_that_the_board_runs_too_fast_is_noticed(rig_in):
     rig = rig_in(sweep={"speed_mm_s": 0.13, "start_mm": -60.5, "end_mm": -60.0, "rate_hz": 5.0})
-    rig.bench.board._true_speed = lambda speed: speed * 1.22 if speed < 1 else speed
+    rig.bench.board.planner.true_speed = lambda speed: speed * 1.22 if speed < 1 else speed
     with pytest.raises(ReflectsepError, match=r"more than 0\.5 % off"):
         rig.run()
 
@@ -482,12 +488,13 @@ def test_changed_plan_firmware_or_camera_refuses_to_go_on(rig_in, record_fault):
     complete(rig.folder)
 
 
-def test_existing_session_needs_resume_and_a_finished_one_has_nothing_to_do(rig_in):
+def test_existing_session_needs_resume_and_a_finished_one_has_nothing_to_do(rig_in, record_fault):
     rig = rig_in()
     rig.run()
     with pytest.raises(ReflectsepError, match="say resume=true"):
         rig_in().run()
     assert Session(rig.folder).finished
+    record_fault("finished session", "finished already, nothing to do", "not connected", "unchanged", "nothing to do")
 
 
 def test_stage_without_switches_goes_on_only_when_a_person_has_zeroed_it(rig_in):
@@ -544,14 +551,22 @@ def test_wall_clock_jump_changes_nothing(rig_in, monkeypatch, record_fault):
     record_fault("wall clock jumps", "nothing", "done", "complete", "not needed")
 
 
-def test_read_only_folder_says_so(tmp_path, rig_in, record_fault, monkeypatch):
-    def refuse(path, *rest, **options):
-        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+def test_disk_without_room_for_what_the_first_picture_shows_is_refused(rig_in, monkeypatch):
+    rig = rig_in()
+    room = []
 
-    monkeypatch.setattr(session_module.os, "open", refuse)
-    with pytest.raises(PermissionError, match="Permission denied"):
-        rig_in().run()
-    record_fault("read-only folder", "Permission denied", "not begun", "nothing", "elsewhere")
+    def usage(folder):
+        room.append(10**12 if not room else 10_000)
+        return SimpleNamespace(free=room[-1])
+
+    monkeypatch.setattr(runner_module.shutil, "disk_usage", usage)
+    rig.devices.camera.snap = lambda name: RawFrame(
+        pixels=np.random.default_rng(0).integers(0, 255, (30, 30), np.uint8)
+    )
+    with pytest.raises(ReflectsepError, match=r"0\.01 MB are free, up to 0\.\d+ MB are needed"):
+        rig.run()
+    assert rig.at_rest()
+    assert whole(rig.folder) == ["full-L1"]
 
 
 def test_plan_names_what_it_refuses():

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from reflectsep.errors import LinkLostError, ReflectsepError, StageError
+from reflectsep.errors import AlarmError, LinkLostError, ReflectsepError, StageError
 from reflectsep.rig.board import Board
 from reflectsep.rig.clock import HostClock, VirtualClock
 from reflectsep.rig.grbl import GrblStage
@@ -116,8 +116,15 @@ def test_slit_position_of_500_frames_in_simulated_time():
 
 @pytest.mark.slow
 def test_slit_position_of_500_frames_in_real_time():
-    with Firmware() as firmware:
-        check_500_frames(stage_on(firmware, reference="here"), HostClock(), firmware.true_position)
+    for _ in range(3):
+        with Firmware() as firmware:
+            try:
+                check_500_frames(stage_on(firmware, reference="here"), HostClock(), firmware.true_position)
+                return
+            except (StageError, AssertionError):
+                if firmware.late_s < 0.008:  # what 20 um take at 2 mm/s, with room for the fit
+                    raise
+    pytest.skip("this machine is too busy to be a board in real time")
 
 
 def check_500_frames(stage, clock, true_position):
@@ -221,7 +228,7 @@ def babbled(chunks):
             stage.poll()
             clock.sleep(0.005)
     except ReflectsepError:
-        alarmed = stage._alarm is not None
+        alarmed = stage._board.alarm is not None
         sent = len(line.written)
         if alarmed:
             with pytest.raises(ReflectsepError):
@@ -261,88 +268,204 @@ def test_status_reports_as_boards_write_them():
     assert (status.state, status.position_mm, status.override_percent) == ("Run", (-0.452, 0.0, 0.0), 100.0)
     assert parse_status("<Idle|MPos:1.000,2.000,3.000|FS:0,0|WCO:0.000,0.000,0.000>") is not None
     assert parse_status("<Idle|WPos:1.000,2.000,3.000|FS:0,0>") is None
+    # As boards with other options write them: no spindle, buffers, pins, a line number, accessories, a fourth axis.
+    for text in (
+        "<Hold:1|MPos:1.000,2.000,3.000|Bf:15,128|F:500|Pn:XYZ>",
+        "<Door:2|MPos:1.000,2.000,3.000|Ln:12|FS:500,8000|Ov:100,100,100|A:SFM>",
+        "<Sleep|MPos:1.000,2.000,3.000,0.000|FS:0,0>",
+    ):
+        status = parse_status(text)
+        assert status is not None
+        assert status.position_mm == (1.0, 2.0, 3.0)
+        assert status.state == text[1:].split("|")[0]
+    override = parse_status("<Run|MPos:1.000,2.000,3.000|FS:0,0|Ov:90,100,100>")
+    assert override is not None
+    assert override.override_percent == 90
     assert parse_status("<Run|MPos:-0.452,0.0") is None
 
 
-# The board itself, by the behaviour that was measured on the firmware.
+# The driver on a board in simulated time: what the firmware does now and then, or only to some.
 
 
-def exchange(board, data, at_s, until_s):
-    board.receive(data, at_s)
-    return board.transmit(until_s).decode()
+class Watched(SimulatedSerial):
+    """The line to the board, with the times of what was written."""
+
+    def __init__(self, bench, written):
+        super().__init__(bench)
+        self._written = written
+
+    def write(self, data):
+        self._written.append((self._bench.clock.now(), data))
+        return super().write(data)
 
 
-def booted(**options):
-    board = Board(**options)
-    board.power_on(0.0)
-    assert board.transmit(1.5).decode().strip().startswith("Grbl 1.1h")
-    return board
+def on_board(board, **options):
+    bench, written = Bench(scene=Stripe(), board=board), []
+    stage = GrblStage(
+        port="p",
+        axes={"x": AXIS},
+        clock=bench.clock,
+        opener=lambda _port, **_: Watched(bench, written),
+        **{"check_mm": 0.0, **options},
+    )
+    return stage, bench, written
 
 
-def test_board_is_deaf_while_it_boots():
-    board = Board()
-    board.power_on(0.0)
-    assert exchange(board, b"G1 X-1 F60\n", 0.5, 3.0).count("ok") == 0
+def test_questions_are_five_a_second_at_most():
+    stage, bench, written = on_board(Board({22: 1}), check_mm=5.0)
+    stage.connect()
+    stage.home()
+    stage.begin("x", -20.0, 10.0)
+    finish(stage, bench.clock)
+    stage.begin("x", -120.0, 10.0)
+    for _ in range(100):
+        stage.poll()
+        bench.clock.sleep(0.005)
+    stage.halt()
+    asked = [time_s for time_s, data in written if data == b"?"]
+    assert len(asked) > 15
+    assert np.diff(asked).min() >= 0.2 - 1e-9
+
+
+class Sleepy(SimulatedSerial):
+    """A line whose host falls asleep once, for 0.33 s, between a question and its answer."""
+
+    def __init__(self, bench, nap_at_s, late):
+        super().__init__(bench)
+        self._nap_at_s, self._late = nap_at_s, late
+
+    def write(self, data):
+        count = super().write(data)
+        if data == b"?" and self._nap_at_s and self._bench.clock.now() > self._nap_at_s:
+            self._nap_at_s = None
+            if self._late:
+                self._awake_s = self._bench.clock.now() + 0.33
+            else:
+                self._bench.clock.sleep(0.33)
+        return count
+
+    @property
+    def in_waiting(self):
+        return 0 if self._late and self._bench.clock.now() < getattr(self, "_awake_s", 0.0) else super().in_waiting
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["the host slept", "the answer came late"])
+def test_report_is_never_taken_for_the_answer_to_a_later_question(late):
+    bench = Bench(scene=Stripe(), board=Board({}))
+    stage = GrblStage(
+        port="p",
+        axes={"x": AXIS},
+        reference="here",
+        clock=bench.clock,
+        opener=lambda _port, **_: Sleepy(bench, 4.0, late),
+    )
+    stage.connect()
+    stage.home()
+    stage.begin("x", -50.0, 10.0)
+    reports = finish(stage, bench.clock)
+    assert len(reports) > 20
+    for report in reports:
+        early, late_s = report.time_s - report.uncertainty_s, report.time_s + report.uncertainty_s
+        places = [bench.board.trace.at(t)[0] for t in (early, late_s)]
+        assert min(places) - 0.01 <= report.position_mm <= max(places) + 0.01
+    assert sum(report.uncertainty_s > 0.05 for report in reports) <= 3
+
+
+def test_startup_lines_that_set_inches_do_not_change_a_motion():
+    stage, bench, _ = on_board(Board({}, startup=["G20", "G91"]), reference="here")
+    stage.connect()
+    stage.home()
+    stage.begin("x", -10.0, 10.0)
+    finish(stage, bench.clock)
+    stage.begin("x", -12.0, 10.0)
+    finish(stage, bench.clock)
+    assert bench.board.position(bench.clock.now())[0] == pytest.approx(-12.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("code", [1, 2])
+def test_reset_waits_until_an_alarm_no_longer_swallows_it(code):
+    stage, bench, _ = on_board(Board({22: 1}))
+    stage.connect()
+    stage.home()
+    stage.begin("x", -50.0, 10.0)
+    bench.clock.sleep(1.0)
+    bench.board.alarm(code, dead=True)
+    with pytest.raises(AlarmError, match=f"ALARM:{code}"):
+        finish(stage, bench.clock)
+    assert stage.halt() == "the stage stands still, its position is lost: it must be homed"
+    assert bench.board.state == "Alarm"
+
+
+def test_homing_is_stopped_by_a_reset_at_once():
+    stage, bench, written = on_board(Board({22: 1}))
+    stage.connect()
+    home, bench.board.homing_s = bench.board._start_homing, 60.0
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    bench.board._start_homing = lambda: home() or setattr(stage._link, "read_line", lambda _: interrupted()) or ""
+    with pytest.raises(KeyboardInterrupt):
+        stage.home()
+    del stage._link.read_line
+    began = bench.clock.now()
+    assert "lost" in stage.halt()
+    assert next(time_s for time_s, data in written if data == b"\x18" and time_s >= began) - began < 0.01
+    assert bench.board.state == "Alarm"
 
 
 @pytest.mark.parametrize(
-    ("line", "answer"),
-    [
-        (b"G21 G91\n", "ok"),
-        (b"FOO\n", "error:2"),
-        (b"G1 X1\n", "error:22"),
-        (b"$H\n", "error:5"),
-        (b"$Q\n", "error:3"),
-    ],
+    ("data", "state"), [(b"!", "Hold:[01]"), (b"\x84", "Door:[02]"), (b"~\x84", "Door:[02]"), (b"\x18", None)]
 )
-def test_board_answers_as_measured(line, answer):
-    assert exchange(booted(), line, 2.0, 2.5).strip() == answer
+def test_motion_that_somebody_stops_is_noticed_within_two_reports(data, state):
+    stage, bench, _ = on_board(Board({22: 1}))
+    stage.connect()
+    stage.home()
+    stage.begin("x", -100.0, 10.0)
+    bench.clock.sleep(1.0)
+    began = bench.clock.now()
+    bench.board.receive(data, began)
+    with pytest.raises(StageError, match=f"is in state {state} in the middle" if state else "ALARM:3"):
+        finish(stage, bench.clock)
+    assert bench.clock.now() - began < 0.5
+    assert ("known" in stage.halt()) == (data == b"!")
 
 
-def test_board_says_ok_to_a_motion_before_its_first_step_and_to_a_dwell_after_its_last():
-    board = booted()
-    assert exchange(board, b"G53 G1 X-2 F600\n", 2.0, 2.008).strip() == "ok"
-    assert board.position(2.008)[0] == 0
-    board.receive(b"G4 P0.01\n", 2.01)
-    said = next(t for t in np.arange(2.02, 4, 0.001) if board.transmit(t))
-    stopped = board.trace.end_s
-    assert 0.08 < said - stopped < 0.1
+@pytest.mark.parametrize(("line", "state"), [(b"$C\n", "Check"), (b"$SLP\n", "Sleep")])
+def test_board_in_another_mode_takes_no_motion(line, state):
+    stage, bench, _ = on_board(Board({}), reference="here")
+    stage.connect()
+    stage.home()
+    bench.board.receive(line, bench.clock.now())
+    with pytest.raises(StageError, match=f"is in state {state}, expected Idle before a motion"):
+        stage.begin("x", -10.0, 10.0)
+    assert bench.board.motion_lines == []
 
 
-def test_board_drops_what_overflows_its_buffer_without_a_word():
-    board = booted()
-    answers = exchange(board, b"G91\n" + b"G1 X-0.1 F60\n" * 60, 2.0, 60.0)
-    assert answers.count("ok") < 30
-    assert "error" not in answers
-    assert board.position(60.0)[0] > -3.0
+def test_locked_board_without_switches_says_what_to_do():
+    board = Board({})
+    stage, bench, _ = on_board(board, reference="here")
+    board.power_on, power_on = lambda now_s: None, board.power_on  # a line whose opening resets nothing
+    power_on(0.0)
+    board.advance(2.0)
+    board.alarm(1, dead=True)
+    board.transmit(3.0)  # to nobody
+    bench.clock.sleep(5.0)
+    stage.connect()
+    with pytest.raises(StageError, match=r"is in state Alarm: .* switch the board off and on"):
+        stage.home()
 
 
-def test_board_runs_too_fast_below_its_slowest_step_rate():
-    board = booted()
-    board.receive(b"G1 X-10 F6\n", 2.0)
-    speed = (board.position(22.0)[0] - board.position(12.0)[0]) / 10.0
-    assert speed == pytest.approx(-30.5 / 250, rel=1e-6)
-
-
-def test_board_is_dead_after_a_soft_limit_until_it_is_reset():
-    board = booted(settings={20: 1, 22: 1})
-    board.receive(b"$H\n", 1.6)
-    board.transmit(30.0)
-    assert "ALARM:2" in exchange(board, b"G53 G1 X5 F600\n", 31.0, 31.2)
-    assert exchange(board, b"?", 32.0, 33.0) == ""
-    assert "Grbl 1.1h" in exchange(board, b"\x18", 34.0, 35.0)
-
-
-def test_board_keeps_its_position_over_a_hold_and_a_reset_and_loses_it_over_a_reset_alone():
-    board = booted()
-    board.receive(b"G53 G1 X-20 F600\n", 2.0)
-    board.receive(b"!", 3.0)
-    assert "Hold:0" in exchange(board, b"?", 3.5, 4.0)
-    answers = exchange(board, b"\x18", 4.0, 5.0)
-    assert "Grbl" in answers
-    assert "ALARM" not in answers
-    board.receive(b"G53 G1 X-20 F600\n", 6.0)
-    assert "ALARM:3" in exchange(board, b"\x18", 6.5, 7.0)
+def test_messages_between_answers_are_no_answers():
+    with Firmware({10: 3}) as firmware:
+        stage = stage_on(firmware, reference="here")
+        stage.connect()
+        stage.home()
+        stage.begin("x", -3.0, 10.0)
+        firmware.say(b"[MSG:Check Limits]\r\n\r\n>G54:ok\r\n[echo: ok]\r\n")
+        finish(stage)
+        assert firmware.true_position(time.monotonic())[0] == pytest.approx(-3.0, abs=1e-9)
+        stage.close()
 
 
 def test_second_interrupt_resets_the_stage_at_once():
