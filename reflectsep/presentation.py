@@ -12,7 +12,7 @@ import torch
 
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, without
-from reflectsep.config import FitSettings, RelightJob, ScatterSettings, ViewJob
+from reflectsep.config import CalibrationSettings, FitSettings, RelightJob, ScatterSettings, ViewJob
 from reflectsep.data import Capture, PhotometricStack, Vector
 from reflectsep.errors import ReflectsepError, SettingsError
 from reflectsep.io.files import atomic_folder, refuse_existing
@@ -137,7 +137,8 @@ def command(separation: Separation, result: str) -> str:
         words.append(f"heldout={spelt(list(document['heldout']))}")
     if document.get("lights_file"):
         words.append(f"lights_file={document['lights_file']}")
-    for group, default in (("fit", FitSettings()), ("scatter", ScatterSettings())):
+    defaults = (("fit", FitSettings()), ("scatter", ScatterSettings()), ("calibration", CalibrationSettings()))
+    for group, default in defaults:
         usual = dataclasses.asdict(default)
         for name, value in document.get("settings", {}).get(group, {}).items():
             if name in usual and value != usual[name]:

@@ -273,7 +273,7 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
             whole = x.d + (state.obs.s_basis if x.s is None else x.s)
             priors = with_ratio(state.priors, state.obs, whole, state.body, state.mask)
             state = rescored(replace(state, priors=priors))
-            state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1}", progress)
+            state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1} of 2", progress)
     return smooth_lobes(rescored(hand_on(state, 1)), options, progress)
 
 
@@ -287,7 +287,7 @@ def smooth_lobes(state: State, options: FitOptions, progress: Progress) -> State
         state = rescored(replace(state, priors=with_lobe(state.priors, prediction)))
         vector = prediction.lobe * state.shared[LOG_C_2].exp()
         found = offer_lobes(state.obs, state.priors, state.found, state.shared, vector, state.effort, state.robust)
-        state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1}", progress)
+        state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1} of {len(scales)}", progress)
     return state
 
 

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 from torch import Tensor
 
 from reflectsep.flags import Flag
@@ -63,8 +64,11 @@ def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = (), mask: Tenso
     tall = min(1.5, max(0.4, shape[0] / shape[1]))
     wide = PANEL_IN + 0.35
     # A colour bar takes its room from the picture beside it.
-    part = [0.62 if all(panel.unit for panel in row) else 0.82 for row in rows]
-    figure = Chart(figsize=(columns * wide, sum(wide * tall * p + 0.7 for p in part)), layout="constrained")
+    part = [0.66 if all(panel.unit for panel in row) else 0.86 for row in rows]
+    size = (columns * wide + 0.35, sum(wide * tall * p + 0.75 for p in part))
+    figure = Chart(figsize=size, layout="compressed")
+    # "compressed" brings pictures of a fixed shape together; what stands between them keeps its distance.
+    figure.get_layout_engine().set(w_pad=0.09, h_pad=0.09)  # type: ignore[union-attr]
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=part)
     for i, row in enumerate(rows):
         for j in range(columns):
@@ -105,9 +109,16 @@ def _draw(figure: Figure, axes: Axes, panel: Panel) -> None:
     bar = figure.colorbar(ScalarMappable(norm, colours), ax=axes, fraction=0.05, pad=0.02, extend="both")
     bar.set_label(panel.unit, fontsize=7.5)
     if panel.logarithmic:
-        for axis_part in (bar.ax.yaxis.set_major_formatter, bar.ax.yaxis.set_minor_formatter):
-            axis_part(lambda value, _: f"{value:g}")
+        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        bar.ax.yaxis.set_minor_formatter(NullFormatter())
     bar.ax.tick_params(labelsize=6.5, which="both")
+
+
+def upper_limit(values: Tensor) -> tuple[float, float]:
+    """From 0 to what 99 % of the values stay below."""
+    known = values[values.isfinite()]
+    return 0.0, max(1e-12, float(known.double().quantile(0.99)) if 0 < known.numel() < 2**24 else 1e-12)
 
 
 def dome(names: Sequence[str], vectors: Tensor, heldout: Mapping[str, Sequence[float]]) -> Chart:
