@@ -122,10 +122,17 @@ def stored(level: Level, scale: tuple[float, float]) -> Float[np.ndarray, "plane
     roots, lobes = scale
     low = (level.flags & (1 << FLAG_BITS) - 1).float()
     high = (level.flags >> FLAG_BITS).float() + (1 << FLAG_BITS) * level.mask.float()
-    layers = [torch.cat([level.d[:, c] / roots, level.B[None] / lobes]) for c in range(level.d.shape[1])]
-    layers += [torch.cat([level.s[:, c] / roots, low[None]]) for c in range(level.s.shape[1])]
-    layers.append(torch.cat([level.w, high[None]]))
-    return torch.cat(layers).clamp(-HALF_MAX, HALF_MAX).numpy().astype(np.float16)
+    channels = level.d.shape[1]
+
+    def layer(k: int) -> Tensor:
+        if k < channels:
+            return torch.cat([level.d[:, k] / roots, level.B[None] / lobes])
+        return torch.cat([level.s[:, k - channels] / roots, low[None]] if k < 2 * channels else [level.w, high[None]])
+
+    planes = np.empty((4 * (2 * channels + 1), *level.mask.shape), np.float16)
+    for k in range(2 * channels + 1):  # one layer at a time: at 24 megapixels all of them in 32 bits are 3 GB
+        planes[4 * k : 4 * k + 4] = layer(k).clamp(-HALF_MAX, HALF_MAX).numpy()
+    return planes
 
 
 def as_drawn(level: Level, scale: tuple[float, float]) -> Level:
