@@ -153,7 +153,8 @@ def _arc(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 def passage(views: Sequence[SweepView]) -> Chart:
     """When the slab passes: against position, with the straight line of a constant speed, and as a map."""
-    figure = Chart(figsize=(9.2, 2.6 * len(views)), layout="constrained")
+    figure = Chart(figsize=(9.2, 2.8 * len(views)), layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.09)  # type: ignore[union-attr]
     axes = figure.subplots(len(views), 2, squeeze=False, width_ratios=(1.7, 1))
     for (line, image), view in zip(axes, views, strict=True):
         row, column = torch.nonzero(view.peak.isfinite(), as_tuple=True)

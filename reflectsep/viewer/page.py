@@ -156,6 +156,7 @@ def description(shown: Shown, accuracy: Accuracy) -> dict[str, Any]:
         "height": height,
         "box": object_box(separation.mask),
         "channels": separation.d.shape[1],
+        "scattered": bool(separation.s.any()),
         "white": shown.white,
         "lights": lights,
         "basis": None if vectors is None else vectors[:3].tolist(),

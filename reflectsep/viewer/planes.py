@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from reflectsep.flags import Flag
 from reflectsep.model import diffuse, edge_width, lobe, lobe_argument
@@ -82,11 +82,8 @@ def halved(level: Level) -> Level:
         small = halved_picture(flat * weight) / share.clamp_min(1e-6)
         return small.reshape(*values.shape[:-2], *small.shape[-2:])
 
-    # Bit by bit: the OR of the flags of the pixels that are on the object.
-    seen = torch.where(level.mask, level.flags, 0)
-    bits = torch.stack([(seen >> bit & 1).float() for bit in range(2 * FLAG_BITS)])
-    small_bits = max_pool2d(pad(bits, _odd(bits)), 2).to(torch.int64)
-    flags = sum((small_bits[bit] << bit for bit in range(2 * FLAG_BITS)), torch.zeros_like(small_bits[0]))
+    seen = pad(torch.where(level.mask, level.flags, 0), _odd(level.flags))
+    flags = seen[::2, ::2] | seen[1::2, ::2] | seen[::2, 1::2] | seen[1::2, 1::2]
     mask = share[0] >= 0.5
     return Level(
         factor=2 * level.factor,
