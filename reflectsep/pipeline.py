@@ -296,8 +296,11 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
     said = f"{job.out}: {summary(separation)}"
     if job.report:
         out = Path(job.out) / "report.html"
-        rows = held_out_rows(separation, separation, capture)
-        presentation.report(out, separation, capture, result=job.out, heldout=rows, progress=journal)
+        baseline = None
+        if job.baseline and bool(separation.s.any()):
+            baseline = lin_lee_beside(separation, capture, job.fit, journal)
+        rows = held_out_rows(separation, baseline or separation, capture)
+        presentation.report(out, separation, capture, result=job.out, baseline=baseline, heldout=rows, progress=journal)
         said += f"\n  report    {out}"
     log = f"{datetime.now(UTC).isoformat(timespec='seconds')} fit of {job.capture}\n{journal.text()}"
     atomic_write(Path(job.out) / "log.txt", lambda path: path.write_text(log, encoding="utf-8"))
@@ -395,21 +398,32 @@ def run_report(job: ReportJob, progress: Progress = silent) -> str:
         capture = load_capture(named, basis=separation.basis, lights_file=lights_file)
         # A result without scattering is Lin & Lee's model itself.
         if job.baseline and bool(separation.s.any()):
-            heldout = [str(name) for name in separation.document.get("heldout", [])]
-            settings = recorded_settings(separation, job.result)
-            baseline = fit(
-                capture,
-                settings=settings,
-                calibration=recorded_calibration(separation),
-                heldout=heldout,
-                progress=progress,
-                scattering="none",
-            )
+            journal = Journal(progress, after=reporting(counts_before(capture), len(capture.sweeps)))
+            baseline = lin_lee_beside(separation, capture, recorded_settings(separation, job.result), journal)
         rows = held_out_rows(separation, baseline or separation, capture)
     presentation.report(
-        Path(job.out), separation, capture, result=job.result, baseline=baseline, heldout=rows, progress=progress
+        Path(job.out),
+        separation,
+        capture,
+        result=job.result,
+        baseline=baseline,
+        heldout=rows,
+        frames=job.frames or (),
+        progress=progress,
     )
     return f"{job.out}: open it in a browser, or print it"
+
+
+def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettings, progress: Progress) -> Separation:
+    """Lin & Lee's model fitted to the same pictures as a result."""
+    return fit(
+        capture,
+        settings=settings,
+        calibration=recorded_calibration(separation),
+        heldout=[str(name) for name in separation.document.get("heldout", [])],
+        progress=progress,
+        scattering="none",
+    )
 
 
 def held_out_rows(separation: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:

@@ -55,7 +55,9 @@ def components(separation: Separation, baseline: Separation | None) -> Section:
         words = "Scattering is taken as zero: this is Lin & Lee's model itself, and has no other to stand beside it."
         parts.append(html.text(words, "dim"))
     elif baseline is None:
-        words = "To see Lin & Lee's components beside these: reflectsep report result=RESULT (it takes a second fit)."
+        words = (
+            "To see Lin & Lee's components beside these: reflectsep report result=RESULT, or fit with baseline=true."
+        )
         parts.append(html.text(words, "dim"))
     return Section(key="components", title="Components", body="".join(parts))
 
