@@ -140,7 +140,7 @@ def _frames(views: Sequence[SweepView]) -> str:
         heads.append(f"frame {frame.index}")
     return html.picture(
         grid(rows, heads, view.peak.isfinite()),
-        f"Three frames of the sweep of light {view.light} along {view.direction}: as captured; without the band "
+        f"Frames of the sweep of light {view.light} along {view.direction}: as captured; without the band "
         "that the "
         "slab lights itself (grey); and with the hole filled by the maximum of its surroundings, as in the "
         "paper's Fig. 2. "

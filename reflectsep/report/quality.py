@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import torch
 
 from reflectsep.flags import WORDS, Flag
@@ -51,7 +53,8 @@ def maps(separation: Separation) -> Section:
         for start in range(0, min(len(signed), 24), 4)
     ]
     parts = [
-        html.picture(grid(rows, mask=mask), "Per pixel, over all lights and channels. Grey: not on the object."),
+        html.picture(grid(rows, mask=mask),
+                     "Per pixel, over all lights and channels. Grey: not on the object, or not determined."),
         html.heading("Picture minus model, light by light"),
         html.picture(grid(light_rows, mask=mask),
                      "Orange and purple are pictures that are darker and brighter than the model."
@@ -62,7 +65,7 @@ def maps(separation: Separation) -> Section:
     chosen = [f for f in Flag if f is not Flag.OUTSIDE_MASK and bool((separation.flags[mask] & int(f)).any())]
     flag_rows = [
         [
-            Panel(title=WORDS[str(flag.name)].split(":")[0][:42],
+            Panel(title=textwrap.fill(WORDS[str(flag.name)].split(":")[0], 28),
                   picture=inside(((separation.flags & int(flag)) != 0).float()),
                   unit="0: no, 1: yes", limits=(0.0, 1.0))
             for flag in chosen[start : start + 4]
