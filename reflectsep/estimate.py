@@ -163,6 +163,11 @@ class TimeLeft:
         return left if by_steps is None or now.part.steps == "uneven" else min(left, by_steps)
 
 
+def labels(parts: Sequence[Part]) -> list[str]:
+    """Lines of a stage list, in order."""
+    return list(dict.fromkeys(part.label for part in parts))
+
+
 def words(seconds: float | None) -> str:
     """A time left as people say it."""
     if seconds is None:

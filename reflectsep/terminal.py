@@ -11,8 +11,7 @@ from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TextColumn, T
 from rich.progress import Progress as RichProgress
 from rich.text import Text
 
-from reflectsep.estimate import Part, TimeLeft, words
-from reflectsep.workload import labels
+from reflectsep.estimate import Part, TimeLeft, labels, words
 
 
 class _Left(ProgressColumn):
@@ -84,8 +83,9 @@ class StageList:
         """The stage that was under way has ended: perhaps before its last step; those left out before it go."""
         if self._under_way is not None:
             task, (_, done, total) = self._task(self._under_way), self._stage
-            ended = {"steps": f"{done}/{done}"} if done < total and "of" not in task.fields["steps"] else {}
-            self._display.update(task.id, total=max(1e-9, task.completed), **ended)
+            early = done < total and "of" not in task.fields["steps"]
+            steps = f"{done}/{done}" if early else task.fields["steps"]
+            self._display.update(task.id, total=max(1e-9, task.completed), steps=steps)
         waiting = {part.label for part in self._left.ahead}
         for label in list(self._tasks):
             if not self._task(label).started and label not in waiting:

@@ -7,7 +7,6 @@ run goes; what counts here is how the stages stand to each other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from reflectsep.data import Capture
@@ -109,8 +108,3 @@ def reporting(counts: Counts, sweeps: int) -> list[Part]:
     """The report: figures of a sweep are its largest share."""
     seconds = 5.0 + 3.0 * sweeps + 1e-6 * counts.size * counts.lights * counts.channels
     return [Part(name="report", label="report", expected_s=seconds, kind="drawing", steps="uneven")]
-
-
-def labels(parts: Sequence[Part]) -> list[str]:
-    """Lines of a stage list, in order."""
-    return list(dict.fromkeys(part.label for part in parts))

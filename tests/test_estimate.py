@@ -3,13 +3,14 @@
 import itertools
 import time
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from reflectsep.config import FitJob, ObjectSettings, SimulateJob
-from reflectsep.estimate import TRUST, Part, TimeLeft, words
+from reflectsep.estimate import TRUST, Part, Steps, TimeLeft, words
 from reflectsep.fit.options import FitOptions
 from reflectsep.pipeline import run_fit, run_simulate
 from reflectsep.workload import Counts, reading, reporting, solving
@@ -23,7 +24,7 @@ class Clock:
         return self.at_s
 
 
-def parts(*seconds, steps="limit"):
+def parts(*seconds, steps: Steps = "limit"):
     return [Part(name=f"part {'abcdef'[i]}", label="x", expected_s=s, steps=steps) for i, s in enumerate(seconds)]
 
 
@@ -166,7 +167,7 @@ RUNS = {
 def test_runs_that_were_timed_are_told_within_a_factor_of_two(name, slowness):
     counts, (sweeps, frames), (alignment_s, passages_s, scattering_s), took = RUNS[name]
     lights = [f"L{i + 1}" for i in range(sweeps)]
-    capture = SimpleNamespace(
+    capture: Any = SimpleNamespace(
         names=lights, sweeps=[SimpleNamespace(light=name, direction="x", count=frames) for name in lights]
     )
     names = ["globals", "globals", "pixels", "joint fit"]
