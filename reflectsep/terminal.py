@@ -47,7 +47,7 @@ class StageList:
     def expect(self, parts: Sequence[Part]) -> None:
         """List what is to come; what was announced before and has not begun goes."""
         self._left.expect(parts)
-        for label in [name for name, task in self._tasks.items() if not self._display.tasks[task].started]:
+        for label in [name for name in self._tasks if not self._task(name).started]:
             self._remove(label)
         for label in labels(parts):
             if label not in self._tasks:
@@ -83,8 +83,7 @@ class StageList:
         """The stage that was under way has ended: perhaps before its last step; those left out before it go."""
         if self._under_way is not None:
             task, (_, done, total) = self._task(self._under_way), self._stage
-            early = done < total and "of" not in task.fields["steps"]
-            steps = f"{done}/{done}" if early else task.fields["steps"]
+            steps = task.fields["steps"].replace(f"{done}/{total}", f"{done}/{done}")
             self._display.update(task.id, total=max(1e-9, task.completed), steps=steps)
         waiting = {part.label for part in self._left.ahead}
         for label in list(self._tasks):

@@ -102,6 +102,9 @@ def test_what_is_to_come_is_listed_and_what_is_left_out_goes():
         show("last", 0, 1)
         assert show.lines() == ["first", "last"]
         show("last", 1, 1)
+        for names in (("a", "b"), ("c",), ("d", "a")):  # announced anew, as more is known
+            show.expect([Part(name=name, label=name, expected_s=1.0) for name in names])
+            assert show.lines() == ["first", "last", *names]
     assert "min left" in stream.getvalue()
 
 
