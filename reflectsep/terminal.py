@@ -15,18 +15,20 @@ from reflectsep.estimate import Part, TimeLeft, labels, words
 
 
 class _Left(ProgressColumn):
-    """The time left of the whole run, beside the stage that is under way."""
+    """The time left of the whole run, beside the first stage that is not behind."""
 
     max_refresh = 0.5
 
     def __init__(self, left: TimeLeft) -> None:
         self._left = left
+        self.display: RichProgress | None = None
         super().__init__()
 
     def render(self, task: Task) -> Text:
-        """What is left, beside the stage under way alone."""
-        under_way = task.started and not task.finished
-        return Text(words(self._left.left_s()) if under_way else "", style="cyan")
+        """What is left, on one line."""
+        tasks = () if self.display is None else self.display.tasks
+        first = next((other.id for other in tasks if not other.finished), None)
+        return Text(words(self._left.left_s()) if task.id == first else "", style="cyan")
 
 
 class StageList:
@@ -58,7 +60,7 @@ class StageList:
         part = self._left(stage, done, total)
         label = part.label
         if label != self._under_way:
-            self._finish()
+            self._finish(label)
             self._under_way = label
         last, last_done, last_total = self._stage
         if stage != last or (done < last_done and last_done >= last_total):
@@ -79,13 +81,13 @@ class StageList:
     def _task(self, label: str) -> Task:
         return next(task for task in self._display.tasks if task.id == self._tasks[label])
 
-    def _finish(self) -> None:
+    def _finish(self, begins: str) -> None:
         """The stage that was under way has ended: perhaps before its last step; those left out before it go."""
         if self._under_way is not None:
             task, (_, done, total) = self._task(self._under_way), self._stage
             steps = task.fields["steps"].replace(f"{done}/{total}", f"{done}/{done}")
             self._display.update(task.id, total=max(1e-9, task.completed), steps=steps)
-        waiting = {part.label for part in self._left.ahead}
+        waiting = {begins, *(part.label for part in self._left.ahead)}
         for label in list(self._tasks):
             if not self._task(label).started and label not in waiting:
                 self._remove(label)
@@ -98,12 +100,14 @@ class StageList:
 def stage_list(stream: TextIO) -> Iterator[StageList]:
     """A stage list on a terminal, for as long as the context lasts."""
     left = TimeLeft()
+    beside = _Left(left)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TextColumn("{task.fields[steps]}"),
         TimeElapsedColumn(),
-        _Left(left),
+        beside,
     )
     with RichProgress(*columns, console=Console(file=stream)) as display:
+        beside.display = display
         yield StageList(display, left)

@@ -92,19 +92,21 @@ def test_bar_of_a_stage_that_is_done_again_may_end_early():
 
 def test_what_is_to_come_is_listed_and_what_is_left_out_goes():
     stream = Terminal()
-    ahead = [Part(name=name, label=name, expected_s=100.0) for name in ("first", "never", "last")]
+    ahead = [Part(name=name, label=name, expected_s=100.0) for name in ("first", "never", "next", "last")]
     with terminal.stage_list(stream) as show:
         show.expect(ahead)
-        assert show.lines() == ["first", "never", "last"]
+        assert show.lines() == ["first", "never", "next", "last"]
         show("first", 1, 2)
         time.sleep(0.4)  # the display draws itself ten times a second
         show("first", 2, 2)
+        show("next", 0, 1)
+        assert show.lines() == ["first", "next", "last"]
         show("last", 0, 1)
-        assert show.lines() == ["first", "last"]
+        assert show.lines() == ["first", "next", "last"]
         show("last", 1, 1)
         for names in (("a", "b"), ("c",), ("d", "a")):  # announced anew, as more is known
             show.expect([Part(name=name, label=name, expected_s=1.0) for name in names])
-            assert show.lines() == ["first", "last", *names]
+            assert show.lines() == ["first", "next", "last", *names]
     assert "min left" in stream.getvalue()
 
 
