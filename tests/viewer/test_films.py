@@ -23,15 +23,16 @@ new Promise((done, failed) => {
   document.body.append(film);
   film.muted = true;
   film.onerror = () => failed(new Error("cannot play: " + film.error.message));
-  film.onloadeddata = () => film.requestVideoFrameCallback(() => {
-    film.requestVideoFrameCallback(() => {  // the picture that was sought is there, not only its place
-      const canvas = document.createElement("canvas");
-      [canvas.width, canvas.height] = [film.videoWidth, film.videoHeight];
-      canvas.getContext("2d").drawImage(film, 0, 0);
-      done([film.duration, canvas.toDataURL()]);
-    });
-    film.currentTime = AT;
-  });
+  const take = () => {
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [film.videoWidth, film.videoHeight];
+    canvas.getContext("2d").drawImage(film, 0, 0);
+    done([film.duration, canvas.toDataURL()]);
+  };
+  // The picture that was sought is there when it is presented; a tab in the background presents none.
+  const wait = (_, shown) => Math.abs(shown.mediaTime - AT) < 0.06 ? take() : film.requestVideoFrameCallback(wait);
+  film.onseeked = () => setTimeout(take, 2000);
+  film.onloadeddata = () => { film.requestVideoFrameCallback(wait); film.currentTime = AT; };
   film.src = "data:video/mp4;base64,FILM";
 })
 """
