@@ -264,6 +264,7 @@ class FitJob:
     heldout: list[str] | None = setting(None, "names of lights to leave out of the fit")
     lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
     report: bool = setting(True, "write report.html beside the result")
+    baseline: bool = setting(False, "fit Lin & Lee's model as well, to stand beside in the report; takes as long again")
 
     def __post_init__(self) -> None:
         check(self)
@@ -332,6 +333,7 @@ class ReportJob:
     capture: str | None = setting(None, "its capture; null: the folder that the result names", path=True)
     out: str = setting("", "report to write (.html); default RESULT/report.html", path=True)
     baseline: bool = setting(True, "fit Lin & Lee's model as well, to stand beside; takes as long as a fit")
+    frames: list[int] | None = setting(None, "frames to show with their lit band and filled hole; null: three, evenly")
     overwrite: bool = setting(False, "replace what is there")
 
     def __post_init__(self) -> None:

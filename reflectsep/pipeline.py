@@ -43,16 +43,17 @@ from reflectsep.config import (
     ViewJob,
 )
 from reflectsep.data import Capture, Light, PhotometricStack, Scattering
-from reflectsep.errors import ResultError, SettingsError
+from reflectsep.errors import ReflectsepError, ResultError, SettingsError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
 from reflectsep.io import calibration as calibration_file
 from reflectsep.io.capture import load_capture
-from reflectsep.io.files import atomic_write, refuse_existing, refuse_folder
+from reflectsep.io.files import atomic_write, inside, refuse_existing, refuse_folder
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
+from reflectsep.io.pictures import read_picture
 from reflectsep.io.stack import read_full, read_mask
-from reflectsep.progress import Journal, Progress, silent
+from reflectsep.progress import Journal, Progress, expect, silent
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
 from reflectsep.report.figures import HeldOut
 from reflectsep.report.sheet import motion_plot
@@ -62,6 +63,7 @@ from reflectsep.scatter.options import ScatterOptions
 from reflectsep.separation import Separation, load, separate
 from reflectsep.settings import nearest
 from reflectsep.summary import capture_summary, describe, summary
+from reflectsep.workload import Counts, reading, reporting, solving
 
 __all__ = ["fit", "load", "load_capture"]
 
@@ -99,17 +101,24 @@ def fit(
     capture, used = with_calibration(capture, calibration.file)
     capture = without(capture, heldout)
     least = 8 if settings.scattering == "unknown" else 6
-    progress("pictures", 0, 1)
+    aligned, swept = calibration.registration != "none", bool(capture.sweeps) and settings.scattering == "measured"
+    foreseen, options = counts_before(capture), fit_options(settings)
+    ahead = reading(capture, foreseen, aligned=aligned, swept=swept)
+    expect(progress, [*ahead, *solving(foreseen, options, swept=swept)])
     alignment = None
     if calibration.registration != "none":
         alignment = alignment_of(capture, calibration, scatter, progress)
         clock.lap("alignment")
+    progress("pictures", 0, 1)
     stack, lights = calibrate_stack(capture, minimum=least, alignment=alignment)
     progress("pictures", 1, 1)
+    found = counts_of(stack)
+    ahead = [part for part in reading(capture, found, aligned=False, swept=swept) if part.name != "pictures"]
+    expect(progress, [*ahead, *solving(found, options, swept=swept)])
     clock.lap("pictures")
     scattering = measure(capture, stack, settings, scatter, progress, alignment)
     clock.lap("scattering")
-    fitted = fit_reflectance(stack, scattering, fit_options(settings), progress=progress)
+    fitted = fit_reflectance(stack, scattering, options, progress=progress)
     clock.lap("fit")
     document = describe(
         capture,
@@ -129,6 +138,22 @@ def fit(
     if used is not None:
         document["calibration_file"] = used
     return separate(stack, scattering, fitted, document)
+
+
+def counts_before(capture: Capture) -> Counts:
+    """How large a capture is, by its mask and one picture; what is wrong with them is said where they are used."""
+    try:
+        pixels = int(read_mask(capture).sum())
+        values, _ = read_picture(inside(capture.folder, capture.full(capture.basis[0]).file))
+    except (ReflectsepError, OSError):
+        return Counts(size=1, pixels=1, lights=len(capture.names), channels=1)
+    return Counts(size=values[0].numel(), pixels=pixels, lights=len(capture.names), channels=len(values))
+
+
+def counts_of(stack: PhotometricStack) -> Counts:
+    """How large a capture is."""
+    lights, channels, height, width = stack.images.shape
+    return Counts(size=height * width, pixels=int(stack.mask.sum()), lights=lights, channels=channels)
 
 
 def changed(settings: FitSettings, changes: Mapping[str, Any]) -> FitSettings:
@@ -252,10 +277,10 @@ def run_capture_and_fit(job: CaptureAndFitJob, progress: Progress = silent) -> s
 def run_fit(job: FitJob, progress: Progress = silent) -> str:
     """Separate a capture into a result folder."""
     refuse_folder(job.out, job.overwrite)
-    journal = Journal(progress)
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
+    journal = Journal(progress, after=reporting(counts_before(capture), len(capture.sweeps)) if job.report else ())
     separation = fit(
         capture,
         settings=job.fit,
@@ -271,8 +296,11 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
     said = f"{job.out}: {summary(separation)}"
     if job.report:
         out = Path(job.out) / "report.html"
-        rows = held_out_rows(separation, separation, capture)
-        presentation.report(out, separation, capture, result=job.out, heldout=rows, progress=journal)
+        baseline = None
+        if job.baseline and bool(separation.s.any()):
+            baseline = lin_lee_beside(separation, capture, job.fit, journal)
+        rows = held_out_rows(separation, baseline or separation, capture)
+        presentation.report(out, separation, capture, result=job.out, baseline=baseline, heldout=rows, progress=journal)
         said += f"\n  report    {out}"
     log = f"{datetime.now(UTC).isoformat(timespec='seconds')} fit of {job.capture}\n{journal.text()}"
     atomic_write(Path(job.out) / "log.txt", lambda path: path.write_text(log, encoding="utf-8"))
@@ -317,25 +345,11 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     lights_file = separation.document.get("lights_file")
     capture = load_capture(folder, basis=separation.basis, lights_file=lights_file)
     heldout = [str(name) for name in separation.document.get("heldout", [])]
-    baseline = lin_lee(separation, capture, job.result, heldout, progress)
+    baseline = separation
+    if bool(separation.s.any()):  # else it is Lin & Lee's model itself
+        baseline = lin_lee_beside(separation, capture, recorded_settings(separation, job.result), progress)
     pictures = held_out_pictures(capture, heldout) if heldout else None
     return compare_result(separation, baseline, capture, heldout, pictures, Path(job.out))
-
-
-def lin_lee(
-    separation: Separation, capture: Capture, result: str, heldout: Sequence[str], progress: Progress
-) -> Separation:
-    """Lin & Lee's model fitted as `separation` was; a result without scattering is that model already."""
-    if not bool(separation.s.any()):
-        return separation
-    return fit(
-        capture,
-        settings=recorded_settings(separation, result),
-        calibration=recorded_calibration(separation),
-        heldout=heldout,
-        progress=progress,
-        scattering="none",
-    )
 
 
 def recorded_capture(separation: Separation, result: str) -> Path:
@@ -377,14 +391,34 @@ def run_report(job: ReportJob, progress: Progress = silent) -> str:
     if job.capture is not None or Path(named, "").is_dir():
         lights_file = separation.document.get("lights_file")
         capture = load_capture(named, basis=separation.basis, lights_file=lights_file)
-        if job.baseline:
-            heldout = [str(name) for name in separation.document.get("heldout", [])]
-            baseline = lin_lee(separation, capture, job.result, heldout, progress)
+        # A result without scattering is Lin & Lee's model itself.
+        if job.baseline and bool(separation.s.any()):
+            journal = Journal(progress, after=reporting(counts_before(capture), len(capture.sweeps)))
+            baseline = lin_lee_beside(separation, capture, recorded_settings(separation, job.result), journal)
         rows = held_out_rows(separation, baseline or separation, capture)
     presentation.report(
-        Path(job.out), separation, capture, result=job.result, baseline=baseline, heldout=rows, progress=progress
+        Path(job.out),
+        separation,
+        capture,
+        result=job.result,
+        baseline=baseline,
+        heldout=rows,
+        frames=job.frames or (),
+        progress=progress,
     )
     return f"{job.out}: open it in a browser, or print it"
+
+
+def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettings, progress: Progress) -> Separation:
+    """Lin & Lee's model fitted to the same pictures as a result."""
+    return fit(
+        capture,
+        settings=settings,
+        calibration=recorded_calibration(separation),
+        heldout=[str(name) for name in separation.document.get("heldout", [])],
+        progress=progress,
+        scattering="none",
+    )
 
 
 def held_out_rows(separation: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:

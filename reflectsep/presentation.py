@@ -12,7 +12,7 @@ import torch
 
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, without
-from reflectsep.config import FitSettings, RelightJob, ScatterSettings, ViewJob
+from reflectsep.config import CalibrationSettings, FitSettings, RelightJob, ScatterSettings, ViewJob
 from reflectsep.data import Capture, PhotometricStack, Vector
 from reflectsep.errors import ReflectsepError, SettingsError
 from reflectsep.io.files import atomic_folder, refuse_existing
@@ -70,6 +70,7 @@ def report(
     result: str,
     baseline: Separation | None = None,
     heldout: Sequence[HeldOut] = (),
+    frames: Sequence[int] = (),
     progress: Progress,
 ) -> None:
     """Write the report of a result; what its capture no longer tells is left out, and the report says why."""
@@ -84,7 +85,7 @@ def report(
             kept = without(capture, [str(name) for name in separation.document.get("heldout", [])])
             stack, _ = calibrate_stack(kept, minimum=len(kept.names))
             progress("report", 1, 3)
-            views = sweep_views(kept, stack, separation)
+            views = sweep_views(kept, stack, separation, frames)
         except ReflectsepError as error:
             notes.append(f"Of the capture not all could be read again: {error}")
     progress("report", 2, 3)
@@ -115,16 +116,19 @@ def directions(capture: Capture | None, names: Sequence[str]) -> dict[str, Vecto
     return {name: found for name in names if name in lights and (found := lights[name].direction) is not None}
 
 
-def sweep_views(capture: Capture, stack: PhotometricStack, separation: Separation) -> tuple[SweepView, ...]:
-    """Every sweep that the result was made from, as the report shows it."""
+def sweep_views(
+    capture: Capture, stack: PhotometricStack, separation: Separation, frames: Sequence[int] = ()
+) -> tuple[SweepView, ...]:
+    """Every sweep that the result was made from, as the report shows it; of the first the `frames` are shown."""
     lit = {(s["light"], s["direction"]): s["lit_frames"] for s in separation.document.get("sweeps", [])}
     response = response_of(capture)
     views = []
     for sweep in capture.sweeps:
         if (sweep.light, sweep.direction) in lit and sweep.light in stack.names:
             stream = developed_stream(capture, open_sweep(capture, sweep), response)
-            frames = float(lit[sweep.light, sweep.direction])
-            views.append(view_sweep(stack, stream, n_d=float(separation.n_d), lit_frames=frames))
+            lit_frames = float(lit[sweep.light, sweep.direction])
+            chosen = () if views else frames
+            views.append(view_sweep(stack, stream, n_d=float(separation.n_d), lit_frames=lit_frames, frames=chosen))
     return tuple(views)
 
 
@@ -137,7 +141,8 @@ def command(separation: Separation, result: str) -> str:
         words.append(f"heldout={spelt(list(document['heldout']))}")
     if document.get("lights_file"):
         words.append(f"lights_file={document['lights_file']}")
-    for group, default in (("fit", FitSettings()), ("scatter", ScatterSettings())):
+    defaults = (("fit", FitSettings()), ("scatter", ScatterSettings()), ("calibration", CalibrationSettings()))
+    for group, default in defaults:
         usual = dataclasses.asdict(default)
         for name, value in document.get("settings", {}).get(group, {}).items():
             if name in usual and value != usual[name]:

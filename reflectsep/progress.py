@@ -1,6 +1,7 @@
 """Progress of the stages: one callable that every stage may be handed, and two ways to show it.
 
 A stage calls `progress(stage, done, total)` as it goes: `stage` is its name, `done` of `total` steps are behind it.
+Who knows what is to come announces it by `expect`, so that a display can list it and tell the time left of the whole.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import io
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Protocol, TextIO
+from typing import Protocol, TextIO, runtime_checkable
+
+from reflectsep.estimate import Part
 
 
 class Progress(Protocol):
@@ -19,6 +22,21 @@ class Progress(Protocol):
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Say that `done` of `total` steps of `stage` are behind it."""
         ...
+
+
+@runtime_checkable
+class Foresight(Protocol):
+    """A `Progress` that wants to know what is to come."""
+
+    def expect(self, parts: Sequence[Part]) -> None:
+        """Take note of the parts to come, instead of those announced before."""
+        ...
+
+
+def expect(progress: Progress, parts: Sequence[Part]) -> None:
+    """Announce the parts of a run to whoever shows them; others are not told."""
+    if isinstance(progress, Foresight):
+        progress.expect(parts)
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -57,10 +75,16 @@ class Lines:
 
 
 class Journal:
-    """Hands progress on, and keeps when each stage ended: the lines of a result's log file."""
+    """Hands progress on, and keeps when each stage ended: the lines of a result's log file.
 
-    def __init__(self, progress: Progress = silent) -> None:
+    Args:
+        progress: where it goes.
+        after: what follows the parts that are announced to this.
+    """
+
+    def __init__(self, progress: Progress = silent, after: Sequence[Part] = ()) -> None:
         self._progress = progress
+        self._after = tuple(after)
         self._lines = io.StringIO()
         self._stages = Lines(self._lines)
 
@@ -69,6 +93,10 @@ class Journal:
         self._stages(stage, done, total)
         self._progress(stage, done, total)
 
+    def expect(self, parts: Sequence[Part]) -> None:
+        """Hand an announcement on, with what follows."""
+        expect(self._progress, [*parts, *self._after])
+
     def text(self) -> str:
         """One line a stage that has ended, `NAME: SECONDS s`, in their order."""
         self._stages.close()
@@ -76,50 +104,27 @@ class Journal:
 
 
 @contextmanager
-def bars(stream: TextIO) -> Iterator[Progress]:
-    """One bar a stage on a terminal, with the time that is left."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as RichProgress
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with RichProgress(*columns, console=Console(file=stream)) as display:
-        tasks = {}
-
-        def show(stage: str, done: int, total: int) -> None:
-            for other, task in tasks.items():
-                if other != stage and not display.tasks[task].finished:
-                    # The stage ended before its total (it converged): its end is where it stopped.
-                    display.update(task, total=display.tasks[task].completed)
-            if stage not in tasks:
-                tasks[stage] = display.add_task(stage, total=total)
-            elif done < total and display.tasks[tasks[stage]].finished:
-                display.reset(tasks[stage])  # a stage that is done again
-            display.update(tasks[stage], completed=done, total=total)
-
-        yield show
-
-
-@contextmanager
-def shown(prefix: str = "", *, parallel: bool = False, stream: TextIO | None = None) -> Iterator[Progress]:
-    """Progress as bars on a terminal, else (or where runs go in parallel) as a line a stage.
+def shown(
+    prefix: str = "", *, parallel: bool = False, lines: bool = False, stream: TextIO | None = None
+) -> Iterator[Progress]:
+    """Progress as a stage list on a terminal; elsewhere nothing, or a line a stage where that is asked for.
 
     Args:
         prefix: Written before every line, to tell parallel runs apart.
-        parallel: Other runs write to the same terminal at the same time.
+        parallel: Other runs write to the same terminal at the same time: a line a stage, no list.
+        lines: A line a stage, wherever it goes.
         stream: Where to show it; standard error unless given.
     """
     target: TextIO = sys.stderr if stream is None else stream
-    if target.isatty() and not parallel:
-        with bars(target) as progress:
+    if not lines and not target.isatty():
+        yield silent
+        return
+    if not lines and not parallel:
+        from reflectsep.terminal import stage_list  # rich is for those who see it
+
+        with stage_list(target) as progress:
             yield progress
         return
-    lines = Lines(target, prefix)
-    yield lines
-    lines.close()  # not in a `finally`: a stage that failed has no line of its own, the error is the line
+    written = Lines(target, prefix)
+    yield written
+    written.close()  # not in a `finally`: a stage that failed has no line of its own, the error is the line

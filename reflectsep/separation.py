@@ -236,6 +236,12 @@ def with_components(separation: Separation, stack: PhotometricStack, measured: T
     )
 
 
+def extensions(softness: float, haze: float) -> str:
+    """Which extensions of the paper's formula a result has, in a sentence; empty where it has none."""
+    named = [name for name, value in (("soft shadow edges", softness), ("a haze", haze)) if value > 0]
+    return f"{' and '.join(named)} lowered the cost and {'were' if softness > 0 else 'was'} kept" if named else ""
+
+
 def load(folder: Path | str) -> Separation:
     """Read a result folder back, tensors bit for bit.
 

@@ -17,7 +17,7 @@ from reflectsep.calibrate.alpha import AlphaReport
 from reflectsep.calibrate.exposure import missing_darks
 from reflectsep.data import Capture, Fit, PhotometricStack, Scattering
 from reflectsep.flags import count
-from reflectsep.separation import Separation
+from reflectsep.separation import Separation, extensions
 
 
 def describe(  # noqa: PLR0913  (every stage has its say)
@@ -77,8 +77,9 @@ def describe(  # noqa: PLR0913  (every stage has its say)
     if alignment is not None:
         document["alignment"] = alignment.document(capture)
         warnings.extend(alignment.warnings)
-    if fitted.haze > 0 or fitted.softness > 0:
-        document["extensions"] = "haze and soft shadow edges lowered the cost and were kept"
+    kept = extensions(float(fitted.softness), float(fitted.haze))
+    if kept:
+        document["extensions"] = kept
     document["warnings"] = warnings
     return document
 
@@ -113,6 +114,8 @@ def summary(separation: Separation, *, full: bool = False) -> str:
         lines.append(f"  lights    {', '.join(separation.names)}; basis {', '.join(separation.basis)}")
         height, width = separation.mask.shape
         lines.append(f"  size      {width} x {height}, {int(separation.mask.sum())} pixels on the object")
+        kept = extensions(float(separation.softness), float(separation.haze))
+        lines += [f"  beyond    {kept}"] if kept else []
         for sweep in document.get("sweeps", []):
             gain = f"C {sweep['gain']:.4f} +- {sweep['gain_sd']:.2g}"
             lines.append(f"  sweep     {sweep['light']} along {sweep['direction']}: {gain}")

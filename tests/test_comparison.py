@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-import pytest
 import torch
 
 from reflectsep.comparison import without_a_lobe
-from reflectsep.pipeline import lin_lee
 
 
 def with_pictures(separation, pictures):
@@ -49,11 +47,3 @@ def test_nothing_is_fitted_to_unknown_lights_nor_a_polynomial_to_too_few(result)
     few = result(size=8)
     few = dataclasses.replace(few, alpha=few.alpha[:5], light_vectors=few.light_vectors[:5], residual=few.residual[:5])
     assert set(without_a_lobe(few, alpha)) == {"Lambert"}
-
-
-def test_a_result_without_scattering_is_lin_lee_already(result):
-    separation = result(size=8)
-    bare = dataclasses.replace(separation, s=torch.zeros_like(separation.s))
-    assert lin_lee(bare, None, "result", (), None) is bare  # pyright: ignore[reportArgumentType]
-    with pytest.raises(Exception, match=r"result: separation.json has no usable settings.fit"):
-        lin_lee(separation, None, "result", (), None)  # pyright: ignore[reportArgumentType]

@@ -164,6 +164,17 @@ def test_comparison_has_the_held_out_lights_and_the_truth(result, tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+def test_result_without_scattering_is_compared_as_lin_lees_own(result, captured, tmp_path, monkeypatch):
+    bare = dataclasses.replace(reflectsep.load(result), s=torch.zeros_like(reflectsep.load(result).s))
+    bare.save(tmp_path / "bare")
+    monkeypatch.setattr(pipeline, "fit", None)  # it takes no other fit
+    out = tmp_path / "figure.png"
+    said = pipeline.run_compare(CompareJob(result=str(tmp_path / "bare"), capture=str(captured), out=str(out)))
+    (line,) = [line for line in said.splitlines() if line.strip().startswith("L7 ")]
+    assert "Lin & Lee" in line
+    assert "ours" not in line
+
+
 def test_overflowing_picture_is_bounded_and_others_are_left_as_they_are():
     real = torch.tensor([[[0.5, 2.0]]])
     good = torch.tensor([[[0.1, 3.0]]])

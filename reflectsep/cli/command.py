@@ -28,6 +28,7 @@ _OPTIONS = {
     "--multirun": "multirun",
     "--cfg": "cfg",
     "--json": "json",
+    "--progress": "progress",
 }
 
 
@@ -96,7 +97,8 @@ def _dispatch(words: list[str]) -> int:
 
     if "cfg" in options:
         return runs.show(job, overrides)
-    return runs.several(job, overrides) if "multirun" in options else runs.single(job, overrides)
+    run = runs.several if "multirun" in options else runs.single
+    return run(job, overrides, lines="progress" in options)
 
 
 def _split(words: list[str]) -> tuple[set[str], list[str]]:

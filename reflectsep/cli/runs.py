@@ -32,15 +32,15 @@ _QUIET = (
 """Hydra writes no logs and no copies of the config, and stays in the working folder."""
 
 
-def single(job: str, words: Sequence[str]) -> int:
-    """Run `job` once.
+def single(job: str, words: Sequence[str], *, lines: bool = False) -> int:
+    """Run `job` once; with `lines` its progress is a line a stage, on a terminal or not.
 
     Raises:
         ReflectsepError: whatever stopped it.
     """
     with hydra_ready():
         settings = settings_of(job, checked(job, words, sweeping=False))
-    return _run(job, settings)
+    return _run(job, settings, lines=lines)
 
 
 def show(job: str, words: Sequence[str]) -> int:
@@ -51,7 +51,7 @@ def show(job: str, words: Sequence[str]) -> int:
     return 0
 
 
-def several(job: str, words: Sequence[str]) -> int:
+def several(job: str, words: Sequence[str], *, lines: bool = False) -> int:
     """Run `job` once for every combination of the values given; a run that fails stops no other.
 
     All settings are checked before the first run starts.
@@ -67,7 +67,7 @@ def several(job: str, words: Sequence[str]) -> int:
         assert hydra is not None  # hydra_ready made it
         quiet = [*_QUIET, f"hydra.sweep.dir='{scratch}'"]  # Hydra insists on a folder for its multirun.yaml
         try:
-            batches = hydra.multirun(f"{job}_job", partial(_task, job, swept(own)), [*overrides, *quiet])
+            batches = hydra.multirun(f"{job}_job", partial(_task, job, swept(own), lines), [*overrides, *quiet])
         except (HydraException, OmegaConfBaseException) as error:
             raise SettingsError(flat(error)) from None
     return max((code for code in _codes(batches)), default=0)
@@ -88,21 +88,22 @@ def _check_places(runs: Iterable[tuple[list[str], Job]]) -> None:
         taken[place] = overrides
 
 
-def _task(job: str, keys: frozenset[str], config: DictConfig) -> int:
+def _task(job: str, keys: frozenset[str], lines: bool, config: DictConfig) -> int:
     """One run of several, perhaps in a process of its own: an exit code is all that travels back."""
     hydra = HydraConfig.get()
     varied = [override for override in hydra.overrides.task if override.split("=")[0] in keys]
     where = f"{' '.join(varied)}: " if varied else ""
     try:
-        return _run(job, build(job, config), where, parallel="BasicLauncher" not in hydra.launcher["_target_"])
+        parallel = "BasicLauncher" not in hydra.launcher["_target_"]
+        return _run(job, build(job, config), where, parallel=parallel, lines=lines)
     except (ReflectsepError, OSError) as error:
         return complain(error, where)
 
 
-def _run(job: str, settings: Job, where: str = "", *, parallel: bool = False) -> int:
+def _run(job: str, settings: Job, where: str = "", *, parallel: bool = False, lines: bool = False) -> int:
     from reflectsep import pipeline
 
-    with shown(where, parallel=parallel) as progress:
+    with shown(where, parallel=parallel, lines=lines) as progress:
         text = getattr(pipeline, f"run_{job}")(settings, progress)
     if text:
         print(text, flush=True)

@@ -276,7 +276,7 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
             shine = lobe_pictures(state.obs, state.found.local, state.shared)
             priors = with_facing(priors, state.obs, x, state.shared, shine, state.sigma, state.mask)
             state = rescored(replace(state, priors=priors))
-            state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1}", progress)
+            state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1} of 2", progress)
     return smooth_lobes(rescored(hand_on(state, 1)), options, progress)
 
 
@@ -290,7 +290,7 @@ def smooth_lobes(state: State, options: FitOptions, progress: Progress) -> State
         state = rescored(replace(state, priors=with_lobe(state.priors, prediction)))
         vector = prediction.lobe * state.shared[LOG_C_2].exp()
         found = offer_lobes(state.obs, state.priors, state.found, state.shared, vector, state.effort, state.robust)
-        state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1}", progress)
+        state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1} of {len(scales)}", progress)
     return state
 
 

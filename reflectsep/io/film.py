@@ -18,6 +18,8 @@ GIF_TICK_S = 0.01
 """Time in a GIF is counted in hundredths of a second."""
 CRF = "16"
 """Of H.264: visually lossless."""
+BT_709, SRGB_CURVE, LIMITED, FULL = 1, 13, 1, 2
+"""Codes of ITU-T H.273 for matrix and primaries and for the curve; range as PyAV counts it."""
 
 
 def require_film(path: Path, kind: Film) -> None:
@@ -85,13 +87,25 @@ def _write_video(path: Path, frames: Iterator[np.ndarray], kind: Film, fps: floa
                 stream.pix_fmt = stored
                 if kind == "mp4":
                     stream.options = {"crf": CRF, "preset": "medium"}
+                    _say_colours(stream.codec_context)
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format=form)
+            if kind == "mp4":
+                picture = picture.reformat(
+                    format=stored, src_color_range=FULL, dst_colorspace=BT_709, dst_color_range=LIMITED
+                )
             for packet in stream.encode(picture):
                 container.mux(packet)
             count += 1
         for packet in stream.encode() if stream is not None else ():
             container.mux(packet)
     return count
+
+
+def _say_colours(codec: Any) -> None:
+    """Write down how colour is stored: left to guess, players take one matrix for small films and another for large."""
+    codec.colorspace = codec.color_primaries = BT_709
+    codec.color_trc = SRGB_CURVE
+    codec.color_range = LIMITED
 
 
 def _even(frame: np.ndarray) -> np.ndarray:

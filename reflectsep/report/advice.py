@@ -25,6 +25,12 @@ ADVICE = (
     ("frames lost", "Nothing, where few are lost; where they lie on the object, sweep again."),
     ("the slab reached", "Sweep farther than the object on both sides; pixels never lit have a lower bound alone."),
     ("no sweep of", "Sweep that light along the other axis as well, or use scatter=profile."),
+    (
+        "clipped in more frames",
+        "Expose the slab frames shorter, or narrow the slab; what is clipped tells no scattering.",
+    ),
+    ("not registered", "Nothing, where the rig stood still; otherwise expose so that less is clipped and sweep again."),
+    ("as a mix of", "The direction given for that light is used; look at its picture: clipping, shadow, a wrong name?"),
     ("no dark picture", "Take a dark picture of that exposure: offset and ambient light add up over the frames."),
     ("do not tell alpha apart", "The directions given are used instead; nothing to do if they are trusted."),
     ("not identifiable", "Sweep the basis lights, or take the split where no highlight is seen as arbitrary."),

@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from torch import Tensor
 
 from reflectsep.flags import Flag
@@ -25,6 +26,8 @@ from reflectsep.report.valley import Valley
 SEQUENTIAL, DIVERGING, CYCLE = "cividis", "PuOr", ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Perceptually even maps, and the palette of Okabe and Ito (2008)."""
 PANEL_IN = 2.4
+PAGE_IN = 9.0
+"""Width of the page that a figure stands in."""
 
 
 class Chart(Figure):
@@ -63,27 +66,33 @@ def grid(rows: Sequence[Sequence[Panel]], heads: Sequence[str] = (), mask: Tenso
     tall = min(1.5, max(0.4, shape[0] / shape[1]))
     wide = PANEL_IN + 0.35
     # A colour bar takes its room from the picture beside it.
-    part = [0.62 if all(panel.unit for panel in row) else 0.82 for row in rows]
-    figure = Chart(figsize=(columns * wide, sum(wide * tall * p + 0.7 for p in part)), layout="constrained")
+    part = [0.66 if all(panel.unit for panel in row) else 0.86 for row in rows]
+    size = (columns * wide + 0.35, sum(wide * tall * p + 0.75 for p in part))
+    figure = Chart(figsize=size, layout="compressed")
+    letters = max(1.0, size[0] / PAGE_IN)  # a wider figure is made smaller on the page: its letters shall not be
+    # "compressed" brings pictures of a fixed shape together; what stands between them keeps its distance.
+    figure.get_layout_engine().set(w_pad=0.09, h_pad=0.09)  # type: ignore[union-attr]
     axes = figure.subplots(len(rows), columns, squeeze=False, height_ratios=part)
     for i, row in enumerate(rows):
         for j in range(columns):
             if j < len(row) and row[j].picture is not None:
-                _draw(figure, axes[i][j], row[j])
+                _draw(figure, axes[i][j], row[j], letters)
                 axes[i][j].set_xlim(box[1].start - 0.5, box[1].stop - 0.5)
                 axes[i][j].set_ylim(box[0].stop - 0.5, box[0].start - 0.5)
             else:
                 axes[i][j].axis("off")
         if i < len(heads):
-            axes[i][0].set_ylabel(heads[i], fontsize=9, weight="bold")
+            axes[i][0].set_ylabel(heads[i], fontsize=9 * letters, weight="bold")
     return figure
 
 
-def _draw(figure: Figure, axes: Axes, panel: Panel) -> None:
+def _draw(figure: Figure, axes: Axes, panel: Panel, letters: float = 1.0) -> None:
     assert panel.picture is not None
-    axes.set_title(panel.title, fontsize=9)
-    axes.set_xlabel(f"px{'   ' if panel.caption else ''}{panel.caption}", fontsize=7.5)
-    axes.tick_params(labelsize=6.5)
+    axes.set_title(panel.title, fontsize=9 * letters)
+    axes.set_xlabel(f"px{'   ' if panel.caption else ''}{panel.caption}", fontsize=7.5 * letters)
+    axes.tick_params(labelsize=6.5 * letters)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(4, integer=True))
     if not panel.unit:
         axes.imshow(tone(panel.picture, white=panel.white), interpolation="nearest")
         return
@@ -103,11 +112,18 @@ def _draw(figure: Figure, axes: Axes, panel: Panel) -> None:
     shown = np.ma.masked_invalid(values)
     axes.imshow(shown, norm=norm, cmap=colours, interpolation="nearest")
     bar = figure.colorbar(ScalarMappable(norm, colours), ax=axes, fraction=0.05, pad=0.02, extend="both")
-    bar.set_label(panel.unit, fontsize=7.5)
+    bar.set_label(panel.unit, fontsize=7.5 * letters)
     if panel.logarithmic:
-        for axis_part in (bar.ax.yaxis.set_major_formatter, bar.ax.yaxis.set_minor_formatter):
-            axis_part(lambda value, _: f"{value:g}")
-    bar.ax.tick_params(labelsize=6.5, which="both")
+        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    bar.ax.tick_params(labelsize=6.5 * letters, which="both")
+
+
+def upper_limit(values: Tensor) -> tuple[float, float]:
+    """From 0 to what 99 % of the values stay below."""
+    known = values[values.isfinite()]
+    return 0.0, max(1e-12, float(known.double().quantile(0.99)) if 0 < known.numel() < 2**24 else 1e-12)
 
 
 def dome(names: Sequence[str], vectors: Tensor, heldout: Mapping[str, Sequence[float]]) -> Chart:
@@ -142,7 +158,8 @@ def _arc(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 def passage(views: Sequence[SweepView]) -> Chart:
     """When the slab passes: against position, with the straight line of a constant speed, and as a map."""
-    figure = Chart(figsize=(9.2, 2.6 * len(views)), layout="constrained")
+    figure = Chart(figsize=(9.2, 2.8 * len(views)), layout="constrained")
+    figure.get_layout_engine().set(h_pad=0.09)  # type: ignore[union-attr]
     axes = figure.subplots(len(views), 2, squeeze=False, width_ratios=(1.7, 1))
     for (line, image), view in zip(axes, views, strict=True):
         row, column = torch.nonzero(view.peak.isfinite(), as_tuple=True)

@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from reflectsep.io.files import atomic_write
 
 DPI = 120
+UNIT = "capture's units"
+"""Of every linear value: what the capture's files hold."""
 
 STYLE = (files("reflectsep.report") / "style.css").read_text(encoding="utf-8")
 

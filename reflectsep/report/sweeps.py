@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -46,7 +47,9 @@ class SweepView:
     frames: tuple[ShownFrame, ...]
 
 
-def view_sweep(stack: PhotometricStack, stream: FrameStream, *, n_d: float, lit_frames: float) -> SweepView:
+def view_sweep(
+    stack: PhotometricStack, stream: FrameStream, *, n_d: float, lit_frames: float, frames: Sequence[int] = ()
+) -> SweepView:
     """Watch a sweep pass.
 
     Args:
@@ -54,13 +57,14 @@ def view_sweep(stack: PhotometricStack, stream: FrameStream, *, n_d: float, lit_
         stream: the sweep's frames in the same units.
         n_d: of the result.
         lit_frames: number of frames in which a patch is lit, as the result found it.
+        frames: indices to keep for showing; a few, evenly, where there are none.
 
     Raises:
-        SweepError: no frame received, or what `scatter.frames.steps` raises.
+        SweepError: no frame received, a frame to show that the sweep has not, or what `scatter.frames.steps` raises.
     """
     full = stack.images[stack.names.index(stream.sweep.light)]
     count = len(stream)
-    wanted = {round(count * (k + 1) / (CHOSEN + 1)) for k in range(CHOSEN)}
+    wanted = set(frames) or {round(count * (k + 1) / (CHOSEN + 1)) for k in range(CHOSEN)}
     kept: dict[int, Tensor] = {}
     root_sum = torch.zeros_like(full)
     best, peak = torch.full(full.shape[1:], -torch.inf), torch.zeros(full.shape[1:])
@@ -81,10 +85,13 @@ def view_sweep(stack: PhotometricStack, stream: FrameStream, *, n_d: float, lit_
             kept[step.index] = step.values.clone()
     if not seen:
         raise SweepError(f"{name_of(stream.sweep)}: no frame to show")
+    if lacking := set(frames) - set(kept):
+        numbers = ", ".join(map(str, sorted(lacking)))
+        raise SweepError(f"{name_of(stream.sweep)}: frames={numbers} to show: the sweep has 0 to {count - 1}")
     # With an even number of lit frames two are alike: their middle is the passage.
     weight = (around - 0.5 * around[1]).clamp_min(0.0)
     peak = peak + (weight[2] - weight[0]) / weight.sum(0).clamp_min(1e-12)
-    frames = tuple(_shown(index, values, peak, stack.mask, lit_frames) for index, values in sorted(kept.items()))
+    shown = tuple(_shown(index, values, peak, stack.mask, lit_frames) for index, values in sorted(kept.items()))
     peak = torch.where(stack.mask, peak, torch.nan)
     return SweepView(
         light=stream.sweep.light,
@@ -94,7 +101,7 @@ def view_sweep(stack: PhotometricStack, stream: FrameStream, *, n_d: float, lit_
         straight=_straight(peak, stream.sweep.direction),
         root_sum=root_sum,
         root_full=signed_root(full, n_d),
-        frames=frames,
+        frames=shown,
     )
 
 

@@ -8,14 +8,16 @@ from pathlib import Path
 
 from reflectsep.data import Capture, PhotometricStack, Vector
 from reflectsep.report import html
+from reflectsep.report.acquisition import captured, scattering
 from reflectsep.report.advice import what_to_do
 from reflectsep.report.charts import Panel, grid
 from reflectsep.report.figures import HeldOut
+from reflectsep.report.findings import components, global_parameters, held_out
 from reflectsep.report.html import Section
-from reflectsep.report.sections import captured, components, global_parameters, held_out, maps, reproduce, scattering
+from reflectsep.report.quality import maps, reproduce
 from reflectsep.report.sweeps import SweepView
 from reflectsep.report.tone import white_point
-from reflectsep.separation import Separation
+from reflectsep.separation import Separation, extensions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,10 +74,12 @@ def lead(facts: Facts) -> str:
         Panel(title="picture", picture=whole[0], white=white, caption=f"white is {white:.3g}"),
         Panel(title="without highlight", picture=separation.highlight_free[0], white=white),
         Panel(title="off-specular (highlight)", picture=separation.specular[0], white=white),
-        Panel(title="local diffuse", picture=separation.local_diffuse[0], white=white),
     ]
-    if bool(separation.scattering.any()):
+    scattered = bool(separation.scattering.any())
+    if scattered:
+        row.append(Panel(title="local diffuse", picture=separation.local_diffuse[0], white=white))
         row.append(Panel(title="scattering", picture=separation.scattering[0], white=white))
+    kept = extensions(float(separation.softness), float(separation.haze))
     rms = float(document.get("residual", {}).get("rms", float("nan")))
     peak = float(whole[:, :, separation.mask].max())
     height, width = separation.mask.shape
@@ -85,9 +89,8 @@ def lead(facts: Facts) -> str:
             grid([row], mask=separation.mask),
             f"The picture under light {separation.basis[0]}, taken apart. All panels share one exposure; values "
             "are linear "
-            "in the capture's units, shown through the sRGB curve. Local diffuse light left the object where it "
-            "entered "
-            "it, scattering left it elsewhere.",
+            "in the capture's units, shown through the sRGB curve."
+            + (" Local diffuse light left the object where it entered it, scattering left it elsewhere." * scattered),
         ),
         html.table(
             [],
@@ -97,6 +100,7 @@ def lead(facts: Facts) -> str:
                 ["misfit", f"{rms:.3g} rms in the capture's units, {100 * rms / peak:.2g} % of the brightest value"],
                 ["gloss n_s", f"{float(separation.n_s):.2f}"],
                 ["n_d", f"{float(separation.n_d):.4f} ({document.get('n_d_source', 'unknown')})"],
+                *([["beyond the paper", kept]] if kept else []),
                 ["made", str(document.get("created", ""))],
             ],
         ),

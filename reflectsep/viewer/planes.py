@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from reflectsep.flags import Flag
 from reflectsep.model import diffuse, edge_width, lobe, lobe_argument
@@ -82,11 +82,8 @@ def halved(level: Level) -> Level:
         small = halved_picture(flat * weight) / share.clamp_min(1e-6)
         return small.reshape(*values.shape[:-2], *small.shape[-2:])
 
-    # Bit by bit: the OR of the flags of the pixels that are on the object.
-    seen = torch.where(level.mask, level.flags, 0)
-    bits = torch.stack([(seen >> bit & 1).float() for bit in range(2 * FLAG_BITS)])
-    small_bits = max_pool2d(pad(bits, _odd(bits)), 2).to(torch.int64)
-    flags = sum((small_bits[bit] << bit for bit in range(2 * FLAG_BITS)), torch.zeros_like(small_bits[0]))
+    seen = pad(torch.where(level.mask, level.flags, 0), _odd(level.flags))
+    flags = seen[::2, ::2] | seen[1::2, ::2] | seen[::2, 1::2] | seen[1::2, 1::2]
     mask = share[0] >= 0.5
     return Level(
         factor=2 * level.factor,
@@ -122,10 +119,17 @@ def stored(level: Level, scale: tuple[float, float]) -> Float[np.ndarray, "plane
     roots, lobes = scale
     low = (level.flags & (1 << FLAG_BITS) - 1).float()
     high = (level.flags >> FLAG_BITS).float() + (1 << FLAG_BITS) * level.mask.float()
-    layers = [torch.cat([level.d[:, c] / roots, level.B[None] / lobes]) for c in range(level.d.shape[1])]
-    layers += [torch.cat([level.s[:, c] / roots, low[None]]) for c in range(level.s.shape[1])]
-    layers.append(torch.cat([level.w, high[None]]))
-    return torch.cat(layers).clamp(-HALF_MAX, HALF_MAX).numpy().astype(np.float16)
+    channels = level.d.shape[1]
+
+    def layer(k: int) -> Tensor:
+        if k < channels:
+            return torch.cat([level.d[:, k] / roots, level.B[None] / lobes])
+        return torch.cat([level.s[:, k - channels] / roots, low[None]] if k < 2 * channels else [level.w, high[None]])
+
+    planes = np.empty((4 * (2 * channels + 1), *level.mask.shape), np.float16)
+    for k in range(2 * channels + 1):  # one layer at a time: at 24 megapixels all of them in 32 bits are 3 GB
+        planes[4 * k : 4 * k + 4] = layer(k).clamp(-HALF_MAX, HALF_MAX).numpy()
+    return planes
 
 
 def as_drawn(level: Level, scale: tuple[float, float]) -> Level:

@@ -163,3 +163,38 @@ def test_an_object_without_pixels_is_refused(exact, tmp_path):
     empty = dataclasses.replace(separation, mask=torch.zeros_like(separation.mask))
     with pytest.raises(ValueError, match="no pixel on the object"):
         write_report(tmp_path / "r.html", Facts(name="x", separation=empty, command=""))
+
+
+def test_frames_to_show_are_those_that_were_asked_for(flat):
+    view = view_sweep(flat, Slab(), n_d=1.0, lit_frames=2.0, frames=[3, 9])
+    assert [frame.index for frame in view.frames] == [3, 9]
+    with pytest.raises(SweepError, match="frames=16 to show: the sweep has 0 to 15"):
+        view_sweep(flat, Slab(), n_d=1.0, lit_frames=2.0, frames=[2, 16])
+
+
+@pytest.mark.parametrize(
+    ("softness", "haze", "said"),
+    [
+        (0.0, 0.0, ""),
+        (0.2, 0.0, "soft shadow edges lowered the cost and were kept"),
+        (0.0, 0.1, "a haze lowered the cost and was kept"),
+        (0.2, 0.1, "soft shadow edges and a haze lowered the cost and were kept"),
+    ],
+)
+def test_only_extensions_that_are_there_are_named(exact, tmp_path, softness, haze, said):
+    separation, _ = exact
+    made = dataclasses.replace(separation, softness=torch.tensor(softness), haze=torch.tensor(haze))
+    write_report(tmp_path / "r.html", Facts(name="x", separation=made, command=""))
+    text = (tmp_path / "r.html").read_text()
+    assert ("lowered the cost" in text) == bool(said)
+    assert said in text
+
+
+def test_the_model_of_lin_lee_is_not_set_beside_itself(exact, tmp_path):
+    separation, _ = exact
+    nothing = torch.zeros_like(separation.s)
+    opaque = dataclasses.replace(separation, s=nothing, scattering=nothing)
+    write_report(tmp_path / "r.html", Facts(name="x", separation=opaque, command=""))
+    text = (tmp_path / "r.html").read_text()
+    assert "has no other to stand beside it" in text
+    assert "Local diffuse light left" not in text

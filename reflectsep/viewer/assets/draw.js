@@ -79,14 +79,19 @@ function panes(width, height) {
   return state.layout === "single" ? [a] : [a, b];
 }
 
+// [left, top, right, bottom] of the objects of all results, in pixels of the first.
+function box_of_all() {
+  const boxes = PAGE.results.map(result => result.box.map(v => v * PAGE.results[0].width / result.width));
+  return [0, 1, 2, 3].map(k => Math[k < 2 ? "min" : "max"](...boxes.map(box => box[k])));
+}
 // Window pixels a pixel of the first result: what the state says, or what makes it fit.
 function zoom_in(rect) {
-  const [left, top, right, bottom] = PAGE.results[0].box;
+  const [left, top, right, bottom] = box_of_all();
   return state.zoom || Math.min(rect[2] / (right - left), rect[3] / (bottom - top));
 }
 // Place of the first result in the middle of a pane, 0 to 1 across and down: what the state says, or the object's.
 function middle_of_view() {
-  const { width, height, box: [left, top, right, bottom] } = PAGE.results[0];
+  const { width, height } = PAGE.results[0], [left, top, right, bottom] = box_of_all();
   return state.zoom ? [state.cx, state.cy] : [(left + right) / 2 / width, (top + bottom) / 2 / height];
 }
 

@@ -52,6 +52,14 @@ function lights_on(result) {
   return found;
 }
 
+// Where the light is at first: at the camera, or amid the basis lights where that would be an extrapolation.
+function first_light() {
+  const basis = PAGE.results[0].basis;
+  if (!basis || Math.min(...unit_alpha(0, 0, 0)) >= 0) return {};
+  const sum = [0, 1, 2].map(k => basis.reduce((total, v) => total + v[k] / size(v), 0));
+  return { x: sum[0] / size(sum), y: sum[1] / size(sum) };
+}
+
 // Place of a captured light on the disc.
 function place_of(result, index) {
   const about = PAGE.results[result], light = about.lights[index];

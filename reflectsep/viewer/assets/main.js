@@ -20,6 +20,7 @@ function refresh() {
 
 function start() {
   if (!start_drawing()) return;
+  Object.assign(DEFAULTS, first_light());
   state = parsed(location.hash);
   start_panel();
   start_pointer();

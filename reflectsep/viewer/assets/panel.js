@@ -19,7 +19,15 @@ function start_panel() {
   const names = PAGE.results.map(result => result.name);
   element("title").textContent = names.join("  |  ");
   element("subtitle").textContent = PAGE.results[0].model;
-  const shown = Object.entries(SHOWN).filter(([key]) => key !== "measured" || PAGE.results[0].measured).map(([key, [, text]]) => [key, text]);
+  const scattered = PAGE.results.some(result => result.scattered);
+  if (!scattered) {  // Lin & Lee's model: one diffuse part
+    SHOWN.local[1] = "diffuse only";
+    element("loc_label").textContent = "Diffuse";
+    element("components_hint").textContent = "1 is as measured; highlight 0 removes it. Scattering was not measured here: the diffuse part holds it. Double-click a slider to set it back.";
+  }
+  element("row_scat").hidden = !scattered;
+  const there = { measured: PAGE.results[0].measured, scattering: scattered };
+  const shown = Object.entries(SHOWN).filter(([key]) => !(key in there) || there[key]).map(([key, [, text]]) => [key, text]);
   for (const id of ["show", "show2"]) {
     fill(element(id), shown);
     element(id).onchange = event => change({ [id]: event.target.value });
@@ -151,7 +159,7 @@ function show_pixel(result, pixel) {
   const rows = [["pixel", where]];
   if (pixel.inside) rows.push(
     ["value", `${value_of(result, pixel).map(v => round(v)).join(", ")} (linear, capture's units)`],
-    ["d", three(pixel.d)], ["s", three(pixel.s)], ["B", round(pixel.B)], ["a + B d", pixel.w.map(v => round(v)).join("  ")],
+    ["d", `${three(pixel.d)} (a basis light each, roots of the capture's units)`], ["s", three(pixel.s)], ["B", round(pixel.B)], ["a + B d", pixel.w.map(v => round(v)).join("  ")],
     ["flags", pixel.flags.map(name => PAGE.flags[name]).join("; ") || "none"]);
   else rows.push(["", "not on the object"]);
   element("pixel").replaceChildren(table(rows));
