@@ -24,7 +24,16 @@ from reflectsep.fit.problem import (
     shape_row,
     unpack_globals,
 )
-from reflectsep.model import Globals, diffuse, edge_width, lobe, reflectance, signed_root
+from reflectsep.model import (
+    HAZE_RATIO,
+    Globals,
+    diffuse,
+    edge_width,
+    lobe,
+    positive_power,
+    reflectance,
+    signed_root,
+)
 
 GRID_N_S = (3.0, 4.5, 6.5, 9.0, 13.0, 19.0, 28.0, 42.0, 65.0, 100.0)
 GRID_HEIGHT = (0.3, 0.55, 1.0, 1.8, 3.2)
@@ -54,12 +63,17 @@ def basis_roots(
     *,
     iterations: int = 16,
 ) -> Float[Tensor, "*pixels 3"]:
-    """d_k of pos(d_k + s_k)^n_d + lobe(a_k + B d_k) = I_k, by Newton from above (the left side is convex there)."""
+    """d_k of pos(d_k + s_k)^n_d + lobe(a_k + B d_k) = I_k, by Newton from above, halving where that leaves the bracket.
+
+    The left side rises with d_k, and is convex but for a haze of an exponent below 1.
+    """
     target = target.clamp_min(1e-5)
     root = target ** (1.0 / float(shared.n_d))
     alone = root - width.square() / (4.0 * root)  # the root if there were no lobe
-    d = torch.minimum(alone - s, (target ** (1.0 / shared.n_s) - shared.a) / B)
-    n_d = float(shared.n_d)
+    high = torch.minimum(alone - s, (target ** (1.0 / shared.n_s) - shared.a) / B)
+    low = torch.minimum(high, -shared.a / B)  # no lobe here, and no more light of the body than there is in all
+    d = high
+    n_d, hazy = float(shared.n_d), float(shared.haze) > 0
     for _ in range(iterations):
         x = d + s
         length = (x.square() + width.square() + 1e-20).sqrt()
@@ -68,8 +82,13 @@ def basis_roots(
         shine = lobe(u, shared.n_s, shared.haze)
         value = lit**n_d + shine - target
         slope = n_d * lit.clamp_min(1e-12) ** (n_d - 1.0) * 0.5 * (1.0 + x / length)
-        slope = slope + B * shared.n_s * shine / u.clamp_min(1e-9)
-        d = d - value / slope.clamp_min(1e-4)
+        rise = shine
+        if hazy:
+            rise = shine - (1.0 - 1.0 / HAZE_RATIO) * shared.haze * positive_power(u, shared.n_s / HAZE_RATIO)
+        slope = slope + B * shared.n_s * rise / u.clamp_min(1e-12)
+        low, high = torch.where(value < 0, d, low), torch.where(value < 0, high, d)
+        step = d - value / slope.clamp_min(1e-4)
+        d = torch.where((step < low) | (step > high), 0.5 * (low + high), step)
     return d
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from reflectsep.fit.body import robust_body
@@ -20,6 +20,7 @@ def double(x):
 
 
 @settings(max_examples=300)
+@example(target=0.01, s=0.0, B=12.0, a=-0.6, n_s=3.0, n_d=1.5, width=0.0, haze=0.03)
 @given(
     target=number(0.01, 1.5),
     s=number(0, 0.4),
