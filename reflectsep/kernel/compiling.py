@@ -59,5 +59,7 @@ def has_compiler() -> bool:
     """Whether a C++ compiler is at hand; says once that without one everything runs, slower."""
     found = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
     if found is None:
-        print("reflectsep: no C++ compiler (g++ or $CXX): kernels run uncompiled, several times slower", file=sys.stderr)
+        print(
+            "reflectsep: no C++ compiler (g++ or $CXX): kernels run uncompiled, several times slower", file=sys.stderr
+        )
     return found is not None

@@ -1,6 +1,6 @@
 """Symmetric 4 x 4 systems as ten maps, solved by hand: no matrix is ever stored, so that a compiler fuses it all.
 
-    V = L D L^T, L unit lower triangular;      V x = b   by  L y = b,  z = D^-1 y,  L^T x = z
+V = L D L^T, L unit lower triangular;      V x = b   by  L y = b,  z = D^-1 y,  L^T x = z
 """
 
 from __future__ import annotations

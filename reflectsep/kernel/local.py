@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int8
+from jaxtyping import Float, Int, Int8
 from torch import Tensor
 
 from reflectsep.kernel.compiling import Speed, accelerated
@@ -49,6 +49,14 @@ class PixelSolution:
 Kernel = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
+@dataclass(frozen=True)
+class Queue:
+    """What is to be solved: entry i starts pixel `which[i]` (pixel i) at `start[:, i]`."""
+
+    start: Float[Tensor, "4 entries"]
+    which: Int[Tensor, "entries"] | None
+
+
 class Block:
     """Slots with the state and the data of the pixels in them."""
 
@@ -56,26 +64,26 @@ class Block:
         self.state = like.new_zeros(STATE_ROWS, size)
         self.state[STATUS] = float(EMPTY)
         self.maps = like.new_zeros(rows, size)
-        self.pixel = torch.zeros(size, dtype=torch.int64, device=like.device)
+        self.entry = torch.zeros(size, dtype=torch.int64, device=like.device)
 
-    def put(self, slots: Tensor, problem: PixelProblem, start: Tensor, first: int) -> None:
-        """Pixels first, first + 1, ... into `slots`."""
+    def put(self, slots: Tensor, problem: PixelProblem, queue: Queue, first: int) -> None:
+        """Entries first, first + 1, ... of the queue into `slots`."""
         cut = slice(first, first + len(slots))
-        at = 0
+        pixels, at = cut if queue.which is None else queue.which[cut], 0
         for values in problem.maps:
-            self.maps[at : at + len(values), slots] = values[:, cut]
+            self.maps[at : at + len(values), slots] = values[:, pixels]
             at += len(values)
-        self.state[PLACE, slots] = start[:, cut]
-        fresh = start.new_tensor([float("inf"), 1.0, 0.0, float(ACTIVE)])
+        self.state[PLACE, slots] = queue.start[:, cut]
+        fresh = queue.start.new_tensor([float("inf"), 1.0, 0.0, float(ACTIVE)])
         self.state[COST : STATUS + 1, slots] = fresh[:, None].expand(-1, len(slots))
-        self.pixel[slots] = torch.arange(first, first + len(slots), device=slots.device)
+        self.entry[slots] = torch.arange(first, first + len(slots), device=slots.device)
 
     def narrowed(self, slots: Tensor, size: int) -> Block:
         """A smaller block with only `slots`."""
         small = Block(size, len(self.maps), self.maps)
         small.state[:, : len(slots)] = self.state[:, slots]
         small.maps[:, : len(slots)] = self.maps[:, slots]
-        small.pixel[: len(slots)] = self.pixel[slots]
+        small.entry[: len(slots)] = self.entry[slots]
         return small
 
 
@@ -86,6 +94,7 @@ def solve_pixels(
     stop: Stop = Stop(),
     *,
     speed: Speed = Speed(),
+    which: Int[Tensor, "entries"] | None = None,
     block: int = BLOCK,
 ) -> PixelSolution:
     """Minimise every pixel's cost over (d_1, d_2, d_3, log B) from `start` (Eqs. 20 to 22).
@@ -96,19 +105,20 @@ def solve_pixels(
         lobe: the globals, held.
         stop: when a pixel is finished.
         speed: whether to compile.
+        which: the pixel of every start, where it is not one start a pixel.
         block: slots, rounded up to a multiple of 64.
 
     Returns:
         Places, costs and how each pixel ended; independent of the block's size and of the pixels' order.
     """
-    pixels, form = len(problem), problem.form(lobe.n_d)
+    pixels, form, queue = start.shape[1], problem.form(lobe.n_d), Queue(start, which)
     constants = pack_constants(problem, lobe)
     kernel = accelerated(two_iterations, (form, stop), pixels, speed, problem.images)
     local, cost = start.clone(), start.new_full((pixels,), float("inf"))
     status = torch.full((pixels,), EMPTY, dtype=torch.int8, device=start.device)
     size = padded(min(block, pixels))
     slots = Block(size, form.rows, problem.images)
-    slots.put(torch.arange(min(size, pixels), device=start.device), problem, start, 0)
+    slots.put(torch.arange(min(size, pixels), device=start.device), problem, queue, 0)
     following, total = min(size, pixels), 0
     while True:
         slots.state = kernel(slots.state, slots.maps, constants)
@@ -122,7 +132,7 @@ def solve_pixels(
             total += harvest(slots, at, local, cost, status)
         new = at[:left] if left else at[:0]
         if len(new):
-            slots.put(new, problem, start, following)
+            slots.put(new, problem, queue, following)
             following += len(new)
         elif left == 0:
             active = (slots.state[STATUS] == ACTIVE).nonzero()[:, 0]
@@ -141,9 +151,9 @@ def padded(count: int) -> int:
 
 def harvest(slots: Block, at: Tensor, local: Tensor, cost: Tensor, status: Tensor) -> int:
     """Write the results of slots `at` to their pixels and empty them; returns their iterations."""
-    pixel = slots.pixel[at]
-    local[:, pixel] = slots.state[PLACE, at]
-    cost[pixel] = slots.state[COST, at]
-    status[pixel] = slots.state[STATUS, at].to(torch.int8)
+    entry = slots.entry[at]
+    local[:, entry] = slots.state[PLACE, at]
+    cost[entry] = slots.state[COST, at]
+    status[entry] = slots.state[STATUS, at].to(torch.int8)
     slots.state[STATUS, at] = float(EMPTY)
     return int(slots.state[COUNT, at].sum())

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 UNKNOWNS = ("d_1", "d_2", "d_3", "log_B")
@@ -100,6 +100,14 @@ class PixelProblem:
     def __len__(self) -> int:
         """Number of pixels."""
         return self.images.shape[1]
+
+    def take(self, index: slice | Int[Tensor, "some"]) -> PixelProblem:
+        """Some of the pixels."""
+        prior = self.prior
+        if prior is not None:
+            prior = PixelPrior(centre=prior.centre[:, index], weight=prior.weight[:, index])
+        weight = None if self.weight is None else self.weight[:, index]
+        return replace(self, images=self.images[:, index], s=self.s[:, index], weight=weight, prior=prior)
 
     def form(self, n_d: float) -> Form:
         """What the code for this problem depends on."""
