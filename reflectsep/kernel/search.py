@@ -217,7 +217,7 @@ def _search(problem: PixelProblem, lobe: Lobe, scan: Scan, speed: Speed) -> Pixe
     which += [(further < torch.inf).nonzero()[:, 0] for further in minima[1:, 0]]
     start = torch.cat([values[:, at] for values, at in zip(starts, which, strict=True)], 1)
     found = solve_pixels(problem, start, lobe, scan.stop, speed=speed, which=torch.cat(which))
-    local, cost, status = found.local[:, :pixels], found.cost[:pixels], found.status[:pixels]
+    local, cost, status = (values[..., :pixels].clone() for values in (found.local, found.cost, found.status))
     after = pixels
     for entries in which[1:]:
         cut = slice(after, after + len(entries))
