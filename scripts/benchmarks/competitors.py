@@ -90,9 +90,9 @@ def theseus_lm(case: Case) -> Tensor:
             rel_err_tolerance=TOLERANCE,
         )
         layer = th.TheseusLayer(optimizer)
-        options = {"damping": 1e-3, "adaptive_damping": True, "ellipsoidal_damping": True, "damping_eps": 1e-3}
+        options = {"damping": 1e-3, "adaptive_damping": True, "ellipsoidal_damping": True, "damping_eps": 1e-9}
         with torch.no_grad():
-            values, _ = layer.forward({"x": case.start.T.contiguous()}, optimizer_kwargs=options)
+            values, _ = layer.forward({"x": case.start.T.double().contiguous()}, optimizer_kwargs=options)
         return values["x"].detach().T
 
 

@@ -1,4 +1,4 @@
-"""The pixel's residual as Theseus takes it."""
+"""The pixel's residual as Theseus takes it, in double precision: in single one wild pixel ends the whole batch."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ class PixelCost(th.CostFunction):
     """One batch element a pixel; l = (d_1, d_2, d_3, log B)."""
 
     def __init__(self, x: th.Vector, images: th.Variable, s: th.Variable, case: Case) -> None:
-        super().__init__(th.ScaleCostWeight(1.0), name="pixels")
+        super().__init__(th.ScaleCostWeight(torch.ones(1, 1, dtype=torch.float64)), name="pixels")
         self.x, self.images, self.s, self.case = x, images, s, case
         self.register_optim_vars(["x"])
         self.register_aux_vars(["images", "s"])
 
     def _parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        p, lobe, x = self.case.problem, self.case.lobe, self.x.tensor
-        d, B = x[:, :3], x[:, 3:].exp()
-        return d @ p.alpha.T, (d + self.s.tensor) @ p.alpha.T, (lobe.a + B * d) @ p.alpha.T, B, p.light_weight.sqrt()
+        d, B, mix = self.x.tensor[:, :3], self.x.tensor[:, 3:].clamp(-7.0, 7.0).exp(), self.case.problem.alpha.double().T
+        u = (self.case.lobe.a.double() + B * d) @ mix
+        return d @ mix, (d + self.s.tensor) @ mix, u, B, self.case.problem.light_weight.double().sqrt()
 
     def error(self) -> Tensor:
         """(pixels, lights)."""
@@ -33,7 +33,7 @@ class PixelCost(th.CostFunction):
     def jacobians(self) -> tuple[list[Tensor], Tensor]:
         """Closed form."""
         y, root, u, B, w = self._parts()
-        n_s, alpha = self.case.lobe.n_s, self.case.problem.alpha
+        n_s, alpha = self.case.lobe.n_s, self.case.problem.alpha.double()
         f = n_s * positive_power(u, n_s - 1.0) * B
         by_d = (w * ((root > 0).to(f.dtype) + f))[..., None] * alpha
         return [torch.cat([by_d, (w * f * y)[..., None]], -1)], self.error()
@@ -49,9 +49,9 @@ class PixelCost(th.CostFunction):
 def make_objective(case: Case) -> tuple[th.Vector, th.Objective]:
     """All pixels as one batch."""
     p = case.problem
-    x = th.Vector(tensor=case.start.T.contiguous(), name="x")
-    images = th.Variable(p.images.T.contiguous(), name="images")
-    s = th.Variable(p.s.T.contiguous(), name="s")
-    objective = th.Objective()
+    x = th.Vector(tensor=case.start.T.double().contiguous(), name="x")
+    images = th.Variable(p.images.T.double().contiguous(), name="images")
+    s = th.Variable(p.s.T.double().contiguous(), name="s")
+    objective = th.Objective(dtype=torch.float64)
     objective.add(PixelCost(x, images, s, case))
     return x, objective
