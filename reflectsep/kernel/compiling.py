@@ -6,16 +6,21 @@ A compiled kernel is cached on disk by torch, so that only the first run on a ma
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
 
+Part = TypeVar("Part")
+
+LEAST_PART = 1 << 14
 WORTH_COMPILING = 1 << 18
 """Pixels below which compilation costs more than it saves."""
 
@@ -26,6 +31,29 @@ class Speed:
 
     compile: Literal["auto", "always", "never"] = "auto"
     """`auto`: from `WORTH_COMPILING` pixels on, where there is a C++ compiler."""
+    cores: int | None = None
+    """Parts that are worked on side by side; None: as many as torch has threads."""
+
+    def parts(self, pixels: int) -> list[slice]:
+        """The pixels shared out to the cores; a part has `LEAST_PART` pixels at least."""
+        cores = torch.get_num_threads() if self.cores is None else self.cores
+        number = max(1, min(cores, pixels // LEAST_PART))
+        ends = [pixels * i // number for i in range(number + 1)]
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def side_by_side(work: Callable[[slice], Part], parts: Sequence[slice]) -> list[Part]:
+    """`work` on every part, each on a core of its own; results in the order of the parts."""
+    if len(parts) == 1:
+        return [work(parts[0])]
+    threads = torch.get_num_threads()
+    # Torch's own threads would fight over the cores that the parts are on.
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(len(parts)) as pool:
+            return list(pool.map(work, parts))
+    finally:
+        torch.set_num_threads(threads)
 
 
 def accelerated(
@@ -49,8 +77,8 @@ def compiled(function: Callable[..., Any], form: tuple[Any, ...]) -> Callable[..
     def kernel(*tensors: Tensor) -> Any:
         return function(*tensors, *form)
 
-    # Everything is to become one loop.
-    options = {"max_fusion_size": 1 << 14}
+    # Everything is to become one loop; a block is one core's work, other cores take other pixels.
+    options = {"max_fusion_size": 1 << 14, "cpp.threads": 1}
     return torch.compile(kernel, dynamic=False, fullgraph=True, options=options)
 
 

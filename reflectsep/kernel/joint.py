@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.kernel.compiling import Speed, accelerated
+from reflectsep.kernel.compiling import Speed, accelerated, side_by_side
 from reflectsep.kernel.linear import PACKED, factorise, scales, solve
 from reflectsep.kernel.local import BLOCK, padded
 from reflectsep.kernel.problem import (
@@ -151,35 +151,41 @@ def reduce_pixels(x: Tensor, maps: Tensor, packed: Tensor, form: Form) -> Tensor
 
 
 class Passes:
-    """The three kernels, and a block's room for the data."""
+    """The three kernels, and how the pixels are shared out."""
 
     def __init__(self, problem: PixelProblem, lobe: Lobe, speed: Speed, block: int) -> None:
         form, pixels, like = problem.form(lobe.n_d), len(problem), problem.images
-        self.problem, self.size = problem, padded(min(block, pixels))
+        self.problem, self.block, self.rows, self.parts = problem, block, form.rows, speed.parts(pixels)
         self.follow: Callable[..., Tensor] = accelerated(follow, (form,), pixels, speed, like)
         self.iterate: Callable[..., Tensor] = accelerated(two_iterations, (form, INNER), pixels, speed, like)
         self.reduce: Callable[..., Tensor] = accelerated(reduce_pixels, (form,), pixels, speed, like)
-        self.maps = like.new_zeros(form.rows, self.size)
-        self.place = like.new_zeros(4, self.size)
 
     def run(self, local: Tensor, result: Tensor, old: Lobe, new: Lobe) -> tuple[float, ReducedSystem]:
         """One pass at the globals `new` from places that were found at `old`; places go to `result`."""
-        before, after = pack_constants(self.problem, old), pack_constants(self.problem, new)
-        step = new.shared - old.shared
-        total = torch.zeros(REDUCED_ROWS, dtype=torch.float64, device=local.device)
-        for start in range(0, len(self.problem), self.size):
-            count = min(self.size, len(self.problem) - start)
-            cut, at = slice(start, start + count), 0
-            for values in self.problem.maps:
-                self.maps[at : at + len(values), :count] = values[:, cut]
-                at += len(values)
-            self.place[:, :count] = local[:, cut]
-            state = self.iterate(self.follow(self.place, self.maps, before, after, step), self.maps, after)
-            place = state[PLACE].contiguous()
-            total += self.reduce(place, self.maps, after)[:, :count].sum(1, dtype=torch.float64)
-            result[:, cut] = place[:, :count]
+        constants = pack_constants(self.problem, old), pack_constants(self.problem, new), new.shared - old.shared
+        totals = side_by_side(lambda part: self.part(part, local, result, constants), self.parts)
+        total = torch.stack(totals).sum(0)
         S = torch.stack([torch.stack([total[1 + PACKED[i][m]] for m in range(4)]) for i in range(4)])
         return float(total[0]), ReducedSystem(S, total[11:])
+
+    def part(self, part: slice, local: Tensor, result: Tensor, constants: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """`run` on the pixels of one core: its share of the sums."""
+        before, after, step = constants
+        size = padded(min(self.block, part.stop - part.start))
+        maps, places = local.new_zeros(self.rows, size), local.new_zeros(4, size)
+        total = torch.zeros(REDUCED_ROWS, dtype=torch.float64, device=local.device)
+        for start in range(part.start, part.stop, size):
+            count = min(size, part.stop - start)
+            cut, at = slice(start, start + count), 0
+            for values in self.problem.maps:
+                maps[at : at + len(values), :count] = values[:, cut]
+                at += len(values)
+            places[:, :count] = local[:, cut]
+            state = self.iterate(self.follow(places, maps, before, after, step), maps, after)
+            place = state[PLACE].contiguous()
+            total += self.reduce(place, maps, after)[:, :count].sum(1, dtype=torch.float64)
+            result[:, cut] = place[:, :count]
+        return total
 
 
 def solve_jointly(

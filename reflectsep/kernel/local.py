@@ -8,13 +8,13 @@ no difference to its result.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int, Int8
 from torch import Tensor
 
-from reflectsep.kernel.compiling import Speed, accelerated
+from reflectsep.kernel.compiling import Speed, accelerated, side_by_side
 from reflectsep.kernel.problem import Lobe, PixelProblem, pack_constants
 from reflectsep.kernel.step import (
     ACTIVE,
@@ -44,6 +44,10 @@ class PixelSolution:
     """CONVERGED, EXHAUSTED or FAILED of `kernel.step`."""
     iterations: int
     """Of all pixels together."""
+
+    def at(self, part: slice) -> PixelSolution:
+        """Views of some of the pixels."""
+        return replace(self, local=self.local[:, part], cost=self.cost[part], status=self.status[part])
 
 
 Kernel = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -111,11 +115,31 @@ def solve_pixels(
     Returns:
         Places, costs and how each pixel ended; independent of the block's size and of the pixels' order.
     """
-    pixels, form, queue = start.shape[1], problem.form(lobe.n_d), Queue(start, which)
+    entries = start.shape[1]
+    found = PixelSolution(
+        local=start.clone(),
+        cost=start.new_full((entries,), float("inf")),
+        status=torch.full((entries,), EMPTY, dtype=torch.int8, device=start.device),
+        iterations=0,
+    )
+
+    def work(part: slice) -> int:
+        own = problem.take(part) if which is None else problem
+        queue = Queue(start[:, part], None if which is None else which[part])
+        return _solve_queue(own, queue, lobe, stop, speed, block, found.at(part))
+
+    total = sum(side_by_side(work, speed.parts(entries)))
+    return replace(found, iterations=total)
+
+
+def _solve_queue(
+    problem: PixelProblem, queue: Queue, lobe: Lobe, stop: Stop, speed: Speed, block: int, found: PixelSolution
+) -> int:
+    """Fill `found` with the results of a queue's entries; returns their iterations."""
+    start, local, cost, status = queue.start, found.local, found.cost, found.status
+    pixels, form = start.shape[1], problem.form(lobe.n_d)
     constants = pack_constants(problem, lobe)
     kernel = accelerated(two_iterations, (form, stop), pixels, speed, problem.images)
-    local, cost = start.clone(), start.new_full((pixels,), float("inf"))
-    status = torch.full((pixels,), EMPTY, dtype=torch.int8, device=start.device)
     size = padded(min(block, pixels))
     slots = Block(size, form.rows, problem.images)
     slots.put(torch.arange(min(size, pixels), device=start.device), problem, queue, 0)
@@ -141,7 +165,7 @@ def solve_pixels(
             if padded(len(active)) <= SMALL_BLOCK < size:
                 size = SMALL_BLOCK
                 slots = slots.narrowed(active, size)
-    return PixelSolution(local=local, cost=cost, status=status, iterations=total)
+    return total
 
 
 def padded(count: int) -> int:

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.kernel.compiling import Speed, accelerated
+from reflectsep.kernel.compiling import Speed, accelerated, side_by_side
 from reflectsep.kernel.local import BLOCK, PixelSolution, padded, solve_pixels
 from reflectsep.kernel.problem import (
     LEAST,
@@ -173,17 +173,21 @@ def scan_pixels(
     steps = [0.0, *(b - a for a, b in pairwise(scan.offsets)), 1.0]
     places = zip((*scan.offsets, scan.offsets[-1] + 1.0), steps, [*(0.0 for _ in scan.offsets), 1.0], strict=True)
     offsets = [problem.images.new_tensor(place) for place in places]
-    size = padded(min(BLOCK, pixels))
-    maps = problem.images.new_zeros(form.rows, size)
-    for start in range(0, pixels, size):
-        count, at = min(size, pixels - start), 0
-        for values in problem.maps:
-            maps[at : at + len(values), :count] = values[:, start : start + count]
-            at += len(values)
-        state = begin(maps, packed)
-        for offset in offsets:
-            state = advance(state, maps, packed, offset)
-        result[:, :, start : start + count] = state[MINIMA:, :count].unflatten(0, (scan.polish, 5))
+
+    def work(part: slice) -> None:
+        size = padded(min(BLOCK, part.stop - part.start))
+        maps = problem.images.new_zeros(form.rows, size)
+        for start in range(part.start, part.stop, size):
+            count, at = min(size, part.stop - start), 0
+            for values in problem.maps:
+                maps[at : at + len(values), :count] = values[:, start : start + count]
+                at += len(values)
+            state = begin(maps, packed)
+            for offset in offsets:
+                state = advance(state, maps, packed, offset)
+            result[:, :, start : start + count] = state[MINIMA:, :count].unflatten(0, (scan.polish, 5))
+
+    side_by_side(work, speed.parts(pixels))
     return result
 
 

@@ -161,3 +161,15 @@ def test_compiled_is_the_same_algorithm_and_as_independent_of_neighbours(scene):
     order = torch.randperm(3000, generator=torch.Generator().manual_seed(3))
     mixed = solve_pixels(made.problem.take(order), made.start[:, order], made.lobe, speed=Speed(compile="always"))
     assert torch.equal(mixed.local, fused.local[:, order])
+
+
+def test_cores_make_no_difference(scene, monkeypatch):
+    from reflectsep.kernel import compiling
+
+    monkeypatch.setattr(compiling, "LEAST_PART", 128)
+    made = scene(900, sigma=0.01)
+    one = solve_pixels(made.problem, made.start, made.lobe, speed=Speed(cores=1))
+    three = solve_pixels(made.problem, made.start, made.lobe, speed=Speed(cores=3))
+    assert len(Speed(cores=3).parts(900)) == 3
+    assert torch.equal(one.local, three.local)
+    assert one.iterations == three.iterations
