@@ -34,6 +34,18 @@ class Speed:
     cores: int | None = None
     """Parts that are worked on side by side; None: as many as torch has threads."""
 
+    def compiles(self, pixels: int, like: Tensor) -> bool:
+        """Whether so many pixels are worth a compiled kernel, and there is a compiler."""
+        wanted = self.compile == "always" or (self.compile == "auto" and pixels >= WORTH_COMPILING)
+        return wanted and (like.is_cuda or has_compiler())
+
+    def block(self, pixels: int, most: int, like: Tensor) -> int:
+        """Slots of a block: always `most` for a compiled kernel, which is made for one size, else no more than needed.
+
+        Whole numbers of vectors, so that no pixel is ever a remainder that is computed otherwise.
+        """
+        return -(-(most if self.compiles(pixels, like) else min(most, pixels)) // 64) * 64
+
     def parts(self, pixels: int) -> list[slice]:
         """The pixels shared out to the cores; a part has `LEAST_PART` pixels at least."""
         cores = torch.get_num_threads() if self.cores is None else self.cores
@@ -60,8 +72,7 @@ def accelerated(
     function: Callable[..., Any], form: tuple[Any, ...], pixels: int, speed: Speed, like: Tensor
 ) -> Callable[..., Any]:
     """`function` with its last arguments `form` bound, compiled if `speed` and the number of pixels say so."""
-    wanted = speed.compile == "always" or (speed.compile == "auto" and pixels >= WORTH_COMPILING)
-    if wanted and (like.is_cuda or has_compiler()):
+    if speed.compiles(pixels, like):
         return compiled(function, form)
     return functools.partial(_bound, function, form)
 

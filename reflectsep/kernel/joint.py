@@ -17,7 +17,7 @@ from torch import Tensor
 
 from reflectsep.kernel.compiling import Speed, accelerated, side_by_side
 from reflectsep.kernel.linear import PACKED, factorise, scales, solve
-from reflectsep.kernel.local import BLOCK, padded
+from reflectsep.kernel.local import BLOCK
 from reflectsep.kernel.problem import (
     Data,
     Constants,
@@ -155,7 +155,8 @@ class Passes:
 
     def __init__(self, problem: PixelProblem, lobe: Lobe, speed: Speed, block: int) -> None:
         form, pixels, like = problem.form(lobe.n_d), len(problem), problem.images
-        self.problem, self.block, self.rows, self.parts = problem, block, form.rows, speed.parts(pixels)
+        self.problem, self.rows, self.parts = problem, form.rows, speed.parts(pixels)
+        self.size = speed.block(pixels, block, like)
         self.follow: Callable[..., Tensor] = accelerated(follow, (form,), pixels, speed, like)
         self.iterate: Callable[..., Tensor] = accelerated(two_iterations, (form, INNER), pixels, speed, like)
         self.reduce: Callable[..., Tensor] = accelerated(reduce_pixels, (form,), pixels, speed, like)
@@ -171,8 +172,8 @@ class Passes:
     def part(self, part: slice, local: Tensor, result: Tensor, constants: tuple[Tensor, Tensor, Tensor]) -> Tensor:
         """`run` on the pixels of one core: its share of the sums."""
         before, after, step = constants
-        size = padded(min(self.block, part.stop - part.start))
-        maps, places = local.new_zeros(self.rows, size), local.new_zeros(4, size)
+        maps, places = local.new_zeros(self.rows, self.size), local.new_zeros(4, self.size)
+        size = self.size
         total = torch.zeros(REDUCED_ROWS, dtype=torch.float64, device=local.device)
         for start in range(part.start, part.stop, size):
             count = min(size, part.stop - start)

@@ -140,7 +140,7 @@ def _solve_queue(
     pixels, form = start.shape[1], problem.form(lobe.n_d)
     constants = pack_constants(problem, lobe)
     kernel = accelerated(two_iterations, (form, stop), pixels, speed, problem.images)
-    size = padded(min(block, pixels))
+    size = speed.block(pixels, block, problem.images)
     slots = Block(size, form.rows, problem.images)
     slots.put(torch.arange(min(size, pixels), device=start.device), problem, queue, 0)
     following, total = min(size, pixels), 0
@@ -162,15 +162,10 @@ def _solve_queue(
             active = (slots.state[STATUS] == ACTIVE).nonzero()[:, 0]
             if len(active) == 0:
                 break
-            if padded(len(active)) <= SMALL_BLOCK < size:
+            if len(active) <= SMALL_BLOCK < size:
                 size = SMALL_BLOCK
                 slots = slots.narrowed(active, size)
     return total
-
-
-def padded(count: int) -> int:
-    """Blocks are whole numbers of vectors, so that no pixel is ever a remainder that is computed otherwise."""
-    return -(-count // 64) * 64
 
 
 def harvest(slots: Block, at: Tensor, local: Tensor, cost: Tensor, status: Tensor) -> int:

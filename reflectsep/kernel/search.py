@@ -5,7 +5,7 @@ other pictures score B. The scan walks up in log B. What makes it cheap:
 
 * the last value's roots, moved along d' = -f d / (q + f) per log B, start the next, so that a few steps of Halley's
   method do (they share the power with the value and the slope; for n_d = 1 the body needs none);
-* the cost's slope along the roots shows a minimum between two values, and a cubic places it: a dozen values do, close
+* the cost's slope along the roots shows a minimum between two values, and a cubic places it: two dozen values do, close
   together where a mirror lobe is to be expected.
 """
 
@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reflectsep.kernel.compiling import Speed, accelerated, side_by_side
-from reflectsep.kernel.local import BLOCK, PixelSolution, padded, solve_pixels
+from reflectsep.kernel.local import BLOCK, PixelSolution, solve_pixels
 from reflectsep.kernel.problem import (
     LEAST,
     Constants,
@@ -52,8 +52,9 @@ AT_ONCE = 1 << 20
 class Scan:
     """The values of B that are tried."""
 
-    offsets: tuple[float, ...] = (-1.2, -0.7, -0.42, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.9, 1.5)
-    """Of log B about log(-2 C_1 / mean_k d), where a mirror lobe without noise would have it; ascending."""
+    offsets: tuple[float, ...] = (-1.2, -0.8, -0.55, *(-0.4 + 1.1 * i / 17 for i in range(18)), 0.9, 1.2, 1.6)
+    """Of log B about log(-2 C_1 / mean_k d), where a mirror lobe without noise would have it; ascending.
+    Close where it is: 99.1 % of the pixels at the best known cost, 40 even ones 98.9 %, 80 over twice the span 99.2 %."""
     polish: int = 3
     """Local minima that are polished, at most."""
     stop: Stop = Stop()
@@ -175,7 +176,7 @@ def scan_pixels(
     offsets = [problem.images.new_tensor(place) for place in places]
 
     def work(part: slice) -> None:
-        size = padded(min(BLOCK, part.stop - part.start))
+        size = speed.block(pixels, BLOCK, problem.images)
         maps = problem.images.new_zeros(form.rows, size)
         for start in range(part.start, part.stop, size):
             count, at = min(size, part.stop - start), 0
