@@ -170,7 +170,8 @@ def joint_table(case: Case, rounds: int) -> list[dict[str, Any]]:
         if entry.result is not None:
             places, found, passes = entry.result
             cost = true_cost(case.head(entry.pixels), places, found)
-            note = f"mean cost {float(cost.mean()):.5g}, n_s {found.n_s:.3f}, {passes} passes"
+            each = statistics.median(entry.times) / passes
+            note = f"mean cost {float(cost.mean()):.5g}, n_s {found.n_s:.3f}, {passes} passes of {each:.3g} us"
         rows.append(line(entry, entries[0], note))
     return rows
 

@@ -89,7 +89,7 @@ def compiled(function: Callable[..., Any], form: tuple[Any, ...]) -> Callable[..
         return function(*tensors, *form)
 
     # Everything is to become one loop; a block is one core's work, other cores take other pixels.
-    options = {"max_fusion_size": 1 << 14, "cpp.threads": 1}
+    options: dict[str, Any] = {"max_fusion_size": 1 << 14, "cpp.threads": 1}
     return torch.compile(kernel, dynamic=False, fullgraph=True, options=options)
 
 

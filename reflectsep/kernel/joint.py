@@ -19,8 +19,8 @@ from reflectsep.kernel.compiling import Speed, accelerated, side_by_side
 from reflectsep.kernel.linear import PACKED, factorise, scales, solve
 from reflectsep.kernel.local import BLOCK
 from reflectsep.kernel.problem import (
-    Data,
     Constants,
+    Data,
     Form,
     Lobe,
     PixelProblem,
@@ -102,7 +102,7 @@ def scaled(factor: Tensor | None, value: Tensor) -> Tensor:
 
 
 def follow(x: Tensor, maps: Tensor, old: Tensor, new: Tensor, step: Tensor, form: Form) -> Tensor:
-    """State of `kernel.step` at the new globals: pixels moved along with the shared step where that lowers their cost."""
+    """State of `kernel.step` at the new globals: pixels moved along with the step where that pays."""
     data, places = read_data(maps.unbind(0), form), list(x.unbind(0))
     before, after = read_constants(old, form), read_constants(new, form)
     here = coupled(places, data, before, form)
@@ -195,7 +195,7 @@ def solve_jointly(
     lobe: Lobe,
     stop: JointStop = JointStop(),
     *,
-    speed: Speed = Speed(),
+    speed: Speed = Speed(),  # noqa: B008  (frozen)
     block: int = BLOCK,
 ) -> JointFit:
     """Minimise the whole cost over every pixel's unknowns and (a_1, a_2, a_3, n_s), from near a minimum.

@@ -95,9 +95,9 @@ def solve_pixels(
     problem: PixelProblem,
     start: Float[Tensor, "4 pixels"],
     lobe: Lobe,
-    stop: Stop = Stop(),
+    stop: Stop = Stop(),  # noqa: B008  (frozen)
     *,
-    speed: Speed = Speed(),
+    speed: Speed = Speed(),  # noqa: B008  (frozen)
     which: Int[Tensor, "entries"] | None = None,
     block: int = BLOCK,
 ) -> PixelSolution:

@@ -1,6 +1,6 @@
 """Eqs. 20 to 22 for many pixels, channel first: one map a picture, a root or an unknown.
 
-    x_j = A_j (d + s),   u_j = A_j (a + B d),   r_j = (x_j)_+^n_d + (u_j)_+^n_s - I_j          l = (d_1, d_2, d_3, log B)
+    x_j = A_j (d + s),   u_j = A_j (a + B d),   r_j = (x_j)_+^n_d + (u_j)_+^n_s - I_j       l = (d_1, d_2, d_3, log B)
 
     cost = 1/2 sum_j lambda_j w_j^2 r_j^2  +  1/2 sum_k p_k (l_k - c_k)^2
 
@@ -208,10 +208,7 @@ class Value:
 def value_of(j: int, d: Sequence[Tensor], B: Tensor, data: Data, constants: Constants, form: Form) -> Value:
     """R_j, q_j, f_j and y_j of the module's head."""
     y = d[j] if j < 3 else mixed(constants.alpha[j - 3], d)
-    if j < 3 or form.own_s:
-        root = y + data.s[j]
-    else:
-        root = y + mixed(constants.alpha[j - 3], data.s)
+    root = y + (data.s[j] if j < 3 or form.own_s else mixed(constants.alpha[j - 3], data.s))
     u = constants.a[j] + B * y
     log_u = u.clamp_min(LEAST).log()
     power = ((constants.n_s - 1.0) * log_u).exp()
@@ -232,18 +229,18 @@ def weight_of(j: int, data: Data, constants: Constants) -> Tensor:
     return weight if data.weight is None else weight * data.weight[j] * data.weight[j]
 
 
-def quadratic(l: Sequence[Tensor], data: Data, constants: Constants, form: Form) -> Quadratic:
-    """Cost, J^T w r and J^T w J at l: one and four and ten maps."""
-    zero = torch.zeros_like(l[0])
+def quadratic(x: Sequence[Tensor], data: Data, constants: Constants, form: Form) -> Quadratic:
+    """Cost, J^T w r and J^T w J at x: one and four and ten maps."""
+    zero = torch.zeros_like(x[0])
     cost, g, V = zero, [zero] * 4, [zero] * 10
     if form.priors:
         for k, at in enumerate((0, 4, 7, 9)):
-            away = l[k] - data.centre[k]
+            away = x[k] - data.centre[k]
             g[k], V[at] = data.prior[k] * away, data.prior[k]
             cost = cost + g[k] * away
-    B = l[3].exp()
+    B = x[3].exp()
     for j in range(form.lights):
-        v = value_of(j, l[:3], B, data, constants, form)
+        v = value_of(j, x[:3], B, data, constants, form)
         w = weight_of(j, data, constants)
         wr, wq, fy = w * v.r, w * v.q, v.f * v.y
         square, cross, pull = wq * v.q, wq * fy, v.q * wr

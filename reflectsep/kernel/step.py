@@ -34,7 +34,7 @@ class Stop:
     max_iterations: int = 50
 
 
-def pinned(l: Sequence[Tensor], g: list[Tensor], V: list[Tensor], bounds: Bounds) -> tuple[list[Tensor], list[Tensor]]:
+def pinned(x: Sequence[Tensor], g: list[Tensor], V: list[Tensor], bounds: Bounds) -> tuple[list[Tensor], list[Tensor]]:
     """G and V with unknowns that press against their bound taken out of the system."""
     g, V = list(g), list(V)
     borders = ((1, 2, 3), (1, 5, 6), (2, 5, 8), (3, 6, 8))
@@ -42,7 +42,7 @@ def pinned(l: Sequence[Tensor], g: list[Tensor], V: list[Tensor], bounds: Bounds
         low, high = bounds.lower[k], bounds.upper[k]
         if low == -float("inf") and high == float("inf"):
             continue
-        held = ((l[k] <= low) & (g[k] > 0)) | ((l[k] >= high) & (g[k] < 0))
+        held = ((x[k] <= low) & (g[k] > 0)) | ((x[k] >= high) & (g[k] < 0))
         g[k] = torch.where(held, 0.0, g[k])
         for at in borders[k]:
             V[at] = torch.where(held, 0.0, V[at])
@@ -51,16 +51,16 @@ def pinned(l: Sequence[Tensor], g: list[Tensor], V: list[Tensor], bounds: Bounds
 
 def iterate(state: list[Tensor], data: Data, constants: Constants, form: Form, stop: Stop) -> list[Tensor]:
     """The state one iteration on; finished pixels stay as they are."""
-    l, cost, mu, count, status = state[PLACE], state[COST], state[DAMPING], state[COUNT], state[STATUS]
+    here, cost, mu, count, status = state[PLACE], state[COST], state[DAMPING], state[COUNT], state[STATUS]
     fresh = cost == float("inf")
-    g, V = pinned(l, state[GRADIENT], state[MATRIX], form.bounds)
+    g, V = pinned(here, state[GRADIENT], state[MATRIX], form.bounds)
     scale = scales(V)
     x = solve(factorise(V, [mu * s for s in scale]), g)
     # -g.step - step V step / 2 for (V + mu D) step = -g
     promised = 0.5 * sum(x[k] * (g[k] + mu * scale[k] * x[k]) for k in range(4))
     trial = []
     for k in range(4):
-        place = torch.where(fresh, l[k], l[k] - x[k])
+        place = torch.where(fresh, here[k], here[k] - x[k])
         low, high = form.bounds.lower[k], form.bounds.upper[k]
         trial.append(place if (low, high) == (-float("inf"), float("inf")) else place.clamp(low, high))
     new = quadratic(trial, data, constants, form)
@@ -75,7 +75,7 @@ def iterate(state: list[Tensor], data: Data, constants: Constants, form: Form, s
     end = torch.where(fresh, torch.where(better, float(ACTIVE), float(FAILED)), end)
     choose = lambda a, b: torch.where(moves, a, b)  # noqa: E731
     return [
-        *(choose(t, old) for t, old in zip(trial, l, strict=True)),
+        *(choose(t, old) for t, old in zip(trial, here, strict=True)),
         choose(new.cost, cost),
         mu,
         count,

@@ -23,7 +23,7 @@ from .yardstick import NotInstalled, constants, library, pointer
 
 
 def scipy_trf(case: Case) -> Tensor:
-    """scipy's trust-region reflective solver, one pixel at a time, closed-form Jacobian."""
+    """Scipy's trust-region reflective solver, one pixel at a time, closed-form Jacobian."""
     try:
         from scipy.optimize import least_squares
     except ImportError:
@@ -48,7 +48,14 @@ def scipy_trf(case: Case) -> Tensor:
     for i in range(start.shape[1]):
         options: dict[str, Any] = {"ftol": TOLERANCE, "xtol": 1e-10, "gtol": 1e-12, "max_nfev": 200}
         with np.errstate(over="ignore"):
-            found[:, i] = least_squares(value, start[:, i], slope, args=(i,), x_scale="jac", **options).x
+            found[:, i] = least_squares(
+                value,
+                start[:, i],
+                jac=slope,  # type: ignore[arg-type]
+                args=(i,),
+                x_scale="jac",
+                **options,
+            ).x
     return torch.from_numpy(found)
 
 
@@ -81,7 +88,7 @@ def theseus_lm(case: Case) -> Tensor:
             raise NotInstalled("Theseus: pip install theseus-ai") from None
         from .theseus_cost import make_objective
 
-        x, objective = make_objective(case)
+        _, objective = make_objective(case)
         optimizer = th.LevenbergMarquardt(
             objective,
             linear_solver_cls=th.CholeskyDenseSolver,

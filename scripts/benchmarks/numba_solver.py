@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 
-def solve_all(images, s, c, tolerance, limit, local):  # noqa: ANN001, ANN201, PLR0913  (numba infers them)
+def solve_all(images, s, c, tolerance, limit, local):
     """LM on every pixel from `local` (4, pixels), in place."""
     n, pixels = images.shape
     zero, one = np.float32(0), np.float32(1)

@@ -1,4 +1,4 @@
-"""The pixels that everyone solves: a bumpy surface made from the model itself, n lights 15 to 30 degrees off the view."""
+"""The pixels that everyone solves: a bumpy surface made from the model itself, lights 15 to 30 degrees off the view."""
 
 from __future__ import annotations
 

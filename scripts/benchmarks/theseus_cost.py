@@ -21,7 +21,11 @@ class PixelCost(th.CostFunction):
         self.register_aux_vars(["images", "s"])
 
     def _parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        d, B, mix = self.x.tensor[:, :3], self.x.tensor[:, 3:].clamp(-7.0, 7.0).exp(), self.case.problem.alpha.double().T
+        d, B, mix = (
+            self.x.tensor[:, :3],
+            self.x.tensor[:, 3:].clamp(-7.0, 7.0).exp(),
+            self.case.problem.alpha.double().T,
+        )
         u = (self.case.lobe.a.double() + B * d) @ mix
         return d @ mix, (d + self.s.tensor) @ mix, u, B, self.case.problem.light_weight.double().sqrt()
 
@@ -42,7 +46,7 @@ class PixelCost(th.CostFunction):
         """Residuals of a pixel."""
         return len(self.case.problem.images)
 
-    def _copy_impl(self, new_name: str | None = None) -> PixelCost:
+    def _copy_impl(self, new_name: str | None = None) -> PixelCost:  # noqa: ARG002  (its interface)
         return PixelCost(self.x.copy(), self.images.copy(), self.s.copy(), self.case)
 
 

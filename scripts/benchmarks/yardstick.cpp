@@ -429,7 +429,7 @@ extern "C" void joint_pass(
   std::memcpy(&before, old_constants, sizeof before), std::memcpy(&now, new_constants, sizeof now);
   Stop stop{tolerance, floor, 50};
   for (int i = 0; i < 15; ++i) sums[i] = 0;
-  constexpr int64_t GROUP = 64;  // vectors summed in float32 before they are added up in float64
+  constexpr int64_t GROUP = 4;  // vectors summed in float32 before they are added up in float64
   for (int64_t group = 0; group < pixels; group += GROUP * W) {
     V part[15] = {};
     for (int64_t first = group; first < pixels && first < group + GROUP * W; first += W) {

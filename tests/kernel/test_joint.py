@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from reflectsep.kernel.joint import JointStop, Passes, coupled, solve_jointly
 from reflectsep.kernel.compiling import Speed
+from reflectsep.kernel.joint import JointStop, Passes, coupled, solve_jointly
 from reflectsep.kernel.problem import pack_constants, read_constants, read_data
 from reflectsep.solve.joint import reduced_system
 from tests.kernel.conftest import Scene
@@ -25,7 +25,9 @@ def test_the_coupling_is_that_of_automatic_differentiation(scene, form):
     W = torch.stack([torch.stack(row, -1) for row in found.W], -2)
     torch.testing.assert_close(W, J.mT @ K)
     H = K.mT @ K
-    torch.testing.assert_close(torch.stack(found.H, -1), torch.stack([H[:, i, j] for i in range(4) for j in range(i, 4)], -1))
+    torch.testing.assert_close(
+        torch.stack(found.H, -1), torch.stack([H[:, i, j] for i in range(4) for j in range(i, 4)], -1)
+    )
     torch.testing.assert_close(torch.stack(found.gradient, -1), (K.mT @ r[..., None])[..., 0])
 
 
