@@ -88,8 +88,9 @@ def compiled(function: Callable[..., Any], form: tuple[Any, ...]) -> Callable[..
     def kernel(*tensors: Tensor) -> Any:
         return function(*tensors, *form)
 
-    # Everything is to become one loop; a block is one core's work, other cores take other pixels.
-    options: dict[str, Any] = {"max_fusion_size": 1 << 14, "cpp.threads": 1}
+    # Everything is to become one loop; a block is one core's work, other cores take other pixels, for which the call
+    # must let go of Python's lock: only the C++ wrapper does.
+    options: dict[str, Any] = {"max_fusion_size": 1 << 14, "cpp.threads": 1, "cpp_wrapper": True}
     return torch.compile(kernel, dynamic=False, fullgraph=True, options=options)
 
 
