@@ -75,16 +75,28 @@ def local_quadratic(
     window = torch.exp(-0.5 * along.square())
     weights, weighted = to_map(weight[:, None], mask), to_map(values * weight[:, None], mask)
 
-    def moment(picture: Tensor, px: int, py: int) -> Float[Tensor, "pixels channels"]:
-        kernel = (along**py * window)[:, None] * (along**px * window)
+    holed = window.clone()
+    holed[reach] = 0.0  # the pixel itself has no say
+
+    def line(picture: Tensor, kernel: Tensor, axis: int) -> Tensor:
+        shape, padding = ((-1, 1), (reach, 0)) if axis == 0 else ((1, -1), (0, reach))
+        return conv2d(picture[:, None], kernel.view(1, 1, *shape), padding=padding)[:, 0]
+
+    # Moments are products of a power of x and one of y: two passes along lines, the first ones shared.
+    pictures = (weights, weighted)
+    rows = [[line(picture, along**py * window, 0) for py in range(5 - 2 * i)] for i, picture in enumerate(pictures)]
+
+    def moment(px: int, py: int, which: int) -> Float[Tensor, "pixels channels"]:
         if px == py == 0:
-            kernel[reach, reach] = 0.0
-        return conv2d(picture[:, None], kernel[None, None], padding=reach)[:, 0][:, mask].T
+            total = line(rows[which][0], holed, 1) + line(pictures[which], holed, 0)
+        else:
+            total = line(rows[which][py], along**px * window, 1)
+        return total[:, mask].T
 
     powers = {(a + c, b + d) for a, b in QUADRATIC for c, d in QUADRATIC}
-    moments = {power: moment(weights, *power)[:, 0] for power in sorted(powers)}
+    moments = {power: moment(*power, 0)[:, 0] for power in sorted(powers)}
     system = torch.stack([torch.stack([moments[a + c, b + d] for c, d in QUADRATIC], -1) for a, b in QUADRATIC], -2)
-    right = torch.stack([moment(weighted, a, b) for a, b in QUADRATIC], 1)
+    right = torch.stack([moment(a, b, 1) for a, b in QUADRATIC], 1)
     unit = system.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
     # A trace of a ridge: where few neighbours are left the surface is flatter rather than wild.
     ridge = 1e-4 * torch.eye(len(QUADRATIC), dtype=values.dtype)

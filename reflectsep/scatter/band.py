@@ -132,7 +132,10 @@ class _Window:
         self.size = 2 * self.reach + 1
         self.centre = band.passage.centre[mask]
         self.first_index = self.centre.round().long() - self.reach
-        channels, pixels = len(evidence.full), int(mask.sum())
+        self.ordered, self.order = self.first_index.sort(stable=True)
+        self.at = mask.flatten().nonzero()[:, 0]
+        self.brought = _Light(evidence)
+        channels, pixels = len(evidence.full), len(self.at)
         self.root = torch.zeros((self.size, channels, pixels))
         self.saturated = torch.zeros((self.size, channels, pixels), dtype=torch.bool)
         self.hole = torch.zeros((self.size, pixels), dtype=torch.bool)
@@ -142,17 +145,21 @@ class _Window:
         self.evidence = evidence
 
     def add(self, step: Step, root: Tensor, hole: Tensor) -> None:
-        slot = step.index - self.first_index
-        inside = (slot >= 0) & (slot < self.size)
-        where, pixels = slot[inside], inside.nonzero()[:, 0]
-        values = root[:, self.mask]
-        self.rest += values * ~inside
-        self.root[where, :, pixels] = values[:, pixels].T
-        self.saturated[where, :, pixels] = step.saturated[:, self.mask][:, pixels].T
+        # Pixels in the order of their windows: those whose window holds this frame stand together.
+        ends = torch.tensor([step.index - self.size + 1, step.index + 1])
+        first, last = torch.searchsorted(self.ordered, ends).tolist()
+        pixels = self.order[first:last]
+        where, at = step.index - self.first_index[pixels], self.at[pixels]
+        values = root.flatten(1)[:, self.at]
+        inside = values[:, pixels].T
+        values[:, pixels] = 0.0
+        self.rest += values
+        self.root[where, :, pixels] = inside
+        self.saturated[where, :, pixels] = step.saturated.flatten(1)[:, at].T
         # A lost frame in the window is a hole too: its neighbours may be lit.
-        self.hole[where, pixels] = hole[self.mask][pixels] | step.lost
+        self.hole[where, pixels] = hole.flatten()[at] | step.lost
         self.present[where, pixels] = not step.lost
-        self.light[where, pixels] = _light(self.evidence, step.index)[self.mask][pixels]
+        self.light[where, pixels] = self.brought.of(step.index).flatten()[at]
 
     def profiles(self) -> Profiles:
         index = self.first_index + torch.arange(self.size)[:, None]
@@ -179,16 +186,22 @@ class _Window:
         return band.lit[self.mask] & ~shadowed
 
 
-def _light(evidence: Evidence, index: int) -> Float[Tensor, "height width"]:
+class _Light:
     """What the slab of a frame lights, summed across it and blurred along it."""
-    band = evidence.band
-    lit = (band.half + 0.5 - (index - band.passage.centre).abs()).clamp(0.0, 1.0) * evidence.mask
-    along = 1 if evidence.stream.sweep.direction == "x" else 0
-    line = (evidence.full.mean(0).clamp(min=0.0) * lit).sum(along)
-    radius = min(12, len(line) - 1)
-    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / BLUR_PX) ** 2)
-    line = torch.nn.functional.conv1d(line[None, None], (taps / taps.sum())[None, None], padding=radius)[0, 0]
-    return line.unsqueeze(along).expand_as(lit)
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.band, self.mask = evidence.band, evidence.mask
+        self.grey = evidence.full.mean(0).clamp(min=0.0) * evidence.mask
+        self.along = 1 if evidence.stream.sweep.direction == "x" else 0
+
+    def of(self, index: int) -> Float[Tensor, "height width"]:
+        """Of one frame, at every pixel."""
+        lit = (self.band.passage.centre - index).abs_().neg_().add_(self.band.half + 0.5).clamp_(0.0, 1.0)
+        line = lit.mul_(self.grey).sum(self.along)
+        radius = min(12, len(line) - 1)
+        taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / BLUR_PX) ** 2)
+        line = torch.nn.functional.conv1d(line[None, None], (taps / taps.sum())[None, None], padding=radius)[0, 0]
+        return line.unsqueeze(self.along).expand_as(lit)
 
 
 def _relative(light: Tensor, own: Tensor) -> Tensor:

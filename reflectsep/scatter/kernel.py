@@ -32,7 +32,8 @@ from reflectsep.scatter.band import Profiles
 
 SMALLEST_SCALE = 0.35
 LARGEST_SCALE = 2.8
-CHUNK = 1 << 14
+CHUNK = 1 << 12
+CACHED = 1 << 11
 MODEL_ERROR = 0.05
 """Relative error of the sum of exponentials; noise counts against it."""
 RIDGE = 1e-3
@@ -83,11 +84,17 @@ def nonnegative_least_squares(
 ) -> Float[Tensor, "unknowns values"]:
     """Minimise x^T N x / 2 - r^T x over x >= 0, one small problem a value, by cyclic coordinate descent."""
     x = torch.zeros_like(right)
-    inverse = 1.0 / torch.diagonal(normal).T.clamp(min=1e-30)
-    for _ in range(passes):
-        for i in range(len(right)):
-            gradient = right[i] - (normal[i] * x).sum(0)
-            x[i] = (x[i] + gradient * inverse[i]).clamp(min=0.0)
+    # The matrices of so many values stay in the cache through all passes.
+    for start in range(0, right.shape[1], CACHED):
+        cut = slice(start, start + CACHED)
+        N, r = normal[..., cut].contiguous(), right[:, cut].contiguous()
+        inverse, own = 1.0 / torch.diagonal(N).T.clamp(min=1e-30), torch.zeros_like(r)
+        product = torch.empty_like(r)
+        for _ in range(passes):
+            for i in range(len(r)):
+                gradient = r[i] - torch.mul(N[i], own, out=product).sum(0)
+                torch.addcmul(own[i], gradient, inverse[i], out=own[i]).clamp_(min=0.0)
+        x[:, cut] = own
     return x
 
 
@@ -125,12 +132,23 @@ def _fill(profiles: Profiles, channel: int, slab: Slab, distance_px: float | Ten
     columns = torch.cat([response, plateau[:, None, :].to(value)], 1)
     weight, size = _weights(value, measured, plateau, noise)
     weighted = columns * weight[:, None]
-    normal = torch.einsum("fip,fjp->ijp", weighted, weighted)
+    normal = _normal(weighted)
     right = torch.einsum("fip,fp->ip", weighted, value * weight)
     ridge = torch.cat([torch.full((2 * len(s),), RIDGE), torch.full((1,), 1e-9)])
     normal += torch.diag(ridge)[..., None] / size**2
     amplitude = nonnegative_least_squares(normal, right)[:-1]
     return _beyond_in_holes(profiles, value, clipped, response, amplitude, far, slab)
+
+
+def _normal(columns: Float[Tensor, "frames unknowns values"]) -> Float[Tensor, "unknowns unknowns values"]:
+    """Products of the columns with each other, value by value: a loop beats a product of thousands of tiny matrices."""
+    unknowns = columns.shape[1]
+    result = columns.new_empty(unknowns, unknowns, columns.shape[2])
+    for i in range(unknowns):
+        for j in range(i, unknowns):
+            result[i, j] = (columns[:, i] * columns[:, j]).sum(0)
+            result[j, i] = result[i, j]
+    return result
 
 
 def _weights(value: Tensor, measured: Tensor, plateau: Tensor, noise: float) -> tuple[Tensor, Tensor]:

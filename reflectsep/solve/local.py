@@ -57,6 +57,34 @@ def normal_equations(r: Tensor, J: Tensor, weight: Tensor) -> tuple[Tensor, Tens
     return weighted.mT @ J, (weighted.mT @ r[..., None])[..., 0]
 
 
+@dataclass(frozen=True)
+class Linearised:
+    """Cost, gradient and Gauss-Newton matrix of every block at some place."""
+
+    cost: Float[Tensor, "blocks"]
+    gradient: Float[Tensor, "blocks P"]
+    V: Float[Tensor, "blocks P P"]
+
+    @classmethod
+    def at(cls, problem: BlockProblem, local: Tensor, shared: Tensor) -> Linearised:
+        """At `local`; a cost that is no number counts as infinite."""
+        r, J = problem.linearise_local(local, shared)
+        V, gradient = normal_equations(r, J, robust_weight(r, problem.threshold))
+        return cls(robust_cost(r, problem.threshold).nan_to_num(nan=torch.inf), gradient, V)
+
+    def take(self, index: Tensor) -> Linearised:
+        """Some of the blocks."""
+        return Linearised(self.cost[index], self.gradient[index], self.V[index])
+
+    def where(self, chosen: Bool[Tensor, "blocks"], other: Linearised) -> Linearised:
+        """This where `chosen`, else the other."""
+        return Linearised(
+            torch.where(chosen, self.cost, other.cost),
+            torch.where(chosen[:, None], self.gradient, other.gradient),
+            torch.where(chosen[:, None, None], self.V, other.V),
+        )
+
+
 def solve_local(
     problem: BlockProblem,
     local: Float[Tensor, "blocks P"],
@@ -71,29 +99,30 @@ def solve_local(
     so far that no step can decrease its cost.
     """
     local = local.clone()
-    cost = problem.costs(local, shared)
-    converged = torch.zeros_like(cost, dtype=torch.bool)
+    # Cost, gradient and matrix at the present place are kept: every iteration evaluates once, at the trial place.
+    here = Linearised.at(problem, local, shared)
+    cost, converged = here.cost.clone(), torch.zeros_like(here.cost, dtype=torch.bool)
     mu = torch.full_like(cost, damping)
     active = torch.arange(len(local), device=local.device)
     part = problem
     iteration = 0
     for iteration in range(1, termination.max_iterations + 1):  # noqa: B007  (reported at the end)
-        here, mu_here, cost_here = local[active], mu[active], cost[active]
-        r, J = part.linearise_local(here, shared)
-        V, gradient = normal_equations(r, J, robust_weight(r, part.threshold))
-        step = solve_damped(V, gradient, mu_here)
-        predicted = -(gradient * step).sum(-1) - 0.5 * (step * (V @ step[..., None])[..., 0]).sum(-1)
-        trial = here + step
-        trial_cost = robust_cost(part.residuals(trial, shared), part.threshold).nan_to_num(nan=torch.inf)
-        better = trial_cost < cost_here
-        local[active] = torch.where(better[:, None], trial, here)
-        cost[active] = torch.where(better, trial_cost, cost_here)
-        mu_here = torch.where(better, mu_here * 0.2, mu_here * 5.0)
-        mu[active] = mu_here.clamp_min(1e-9)
-        done = (predicted <= termination.tolerance * cost_here + termination.floor) | (mu_here > 1e9)
+        place, cost_here = local[active], here.cost
+        step = solve_damped(here.V, here.gradient, mu)
+        predicted = -(here.gradient * step).sum(-1) - 0.5 * (step * (here.V @ step[..., None])[..., 0]).sum(-1)
+        trial = place + step
+        there = Linearised.at(part, trial, shared)
+        better = there.cost < cost_here
+        mu = torch.where(better, mu * 0.2, mu * 5.0)
+        done = (predicted <= termination.tolerance * cost_here + termination.floor) | (mu > 1e9)
+        mu = mu.clamp_min(1e-9)
+        local[active] = torch.where(better[:, None], trial, place)
+        here = there.where(better, here)
+        cost[active] = here.cost
         converged[active[done]] = True
         if done.any():
-            active = active[~done]
+            left = (~done).nonzero()[:, 0]
+            active, mu, here = active[left], mu[left], here.take(left)
             if len(active) == 0:
                 break
             part = problem.take(active)
