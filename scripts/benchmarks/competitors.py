@@ -62,7 +62,7 @@ def scipy_trf(case: Case) -> Tensor:
 @functools.cache
 def _numba_solver() -> Callable[..., None]:
     try:
-        import numba
+        import numba  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise NotInstalled("numba: pip install numba") from None
     from .numba_solver import solve_all
@@ -83,7 +83,7 @@ def theseus_lm(case: Case) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            import theseus as th
+            import theseus as th  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise NotInstalled("Theseus: pip install theseus-ai") from None
         from .theseus_cost import make_objective

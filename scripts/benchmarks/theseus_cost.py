@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import theseus as th
+import theseus as th  # pyright: ignore[reportMissingImports]
 import torch
 from torch import Tensor
 
