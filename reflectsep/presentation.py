@@ -43,7 +43,11 @@ def view(job: ViewJob, progress: Progress) -> str:
     folders = [Path(job.result)] + ([] if job.other is None else [Path(job.other)])
     if len(folders) == 2 and folders[0].resolve() == folders[1].resolve():
         raise SettingsError(f"other={job.other}: is the result itself; give another one to compare with")
-    results = [shown(load(folder), folder.resolve().name) for folder in folders]
+    separations = [load(folder) for folder in folders]
+    names = [folder.resolve().name for folder in folders]
+    if len(names) == 1:
+        names = [str(separations[0].document.get("object") or names[0])]
+    results = [shown(separation, name) for separation, name in zip(separations, names, strict=True)]
     exact = write_page(
         out, results, max_pixels=round(1e6 * job.max_megapixels), measured=job.measured, progress=progress
     )

@@ -14,14 +14,14 @@ from reflectsep.estimate import Part
 from reflectsep.fit.options import FitOptions
 
 SOLVING_US = {
-    "pixels": (450,),
-    "joint fit": (400,),
-    "shadow edges": (500,),
-    "neighbourhood": (850, 650),
-    "smooth lobes": (1500, 550, 370, 270, 200, 170),
+    "pixels": (350,),
+    "joint fit": (300,),
+    "shadow edges": (380,),
+    "neighbourhood": (370, 260),
+    "smooth lobes": (270, 150, 150, 105, 110, 93),
 }
 """Microseconds a pixel of a grey fit of few lights; `_effort` says how it grows with what a pixel has."""
-GLOBALS_S = (11.0, 11.0)
+GLOBALS_S = (9.0, 6.0)
 """Of 300 pixels of a grey fit of few lights; it grows with the power 1.7 of `_effort`."""
 
 
@@ -48,7 +48,7 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
     sweeps = [sweep for sweep in capture.sweeps if sweep.light in capture.names]
     parts = []
     if aligned:
-        pairs = 0.2 + (counts.lights - 1) * (1.0 + 10e-6 * counts.size)
+        pairs = 0.2 + (counts.lights - 1) * (1.0 + 20e-6 * counts.size)
         parts = [Part(name="alignment", label="alignment", expected_s=pairs, kind="reading", steps="even")]
         parts += [
             Part(
@@ -106,5 +106,6 @@ def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
 
 def reporting(counts: Counts, sweeps: int) -> list[Part]:
     """The report: figures of a sweep are its largest share."""
-    seconds = 5.0 + 3.0 * sweeps + 1e-6 * counts.size * counts.lights * counts.channels
+    figures = sweeps * (0.7 + 19e-6 * counts.size)
+    seconds = 3.5 + figures + 1e-6 * counts.size * counts.lights * counts.channels
     return [Part(name="report", label="report", expected_s=seconds, kind="drawing", steps="uneven")]

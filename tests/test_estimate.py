@@ -138,26 +138,20 @@ RUNS = {
     "grey, 96 x 96": (
         Counts(size=9216, pixels=5211, lights=6, channels=1),
         (4, 49),
-        (12.3, 0.8, 1.8),
-        [17.9, 15.8, 3.3, 4.3, 5.0, 7.6, 5.3, 9.8, 3.6, 2.3, 1.9, 19.0],
+        (5.1, 0.1, 0.4),
+        [6.6, 6.1, 1.3, 2.1, 2.3, 2.2, 2.2, 1.3, 0.9, 1.1, 6.1],
     ),
     "photographs": (
         Counts(size=174080, pixels=36528, lights=8, channels=3),
         (0, 0),
-        (15.7, 0, 0),
-        [66.3, 92.4, 31.3, 41.1, 150.8, 67.6, 32.6, 46.6, 28.2, 18.7, 7.2],
+        (14.3, 0, 0),
+        [14.4, 14.8, 11.6, 16.3, 22.8, 16.0, 9.5, 7.6, 8.0, 6.8, 6.0],
     ),
-    "photographs, idle machine": (
-        Counts(size=174080, pixels=36528, lights=8, channels=3),
-        (0, 0),
-        (33.2, 0, 0),
-        [35.1, 41.7, 20.6, 17.0, 105.1, 24.5, 18.7, 12.5, 11.8, 9.6, 8.3],
-    ),
-    "colour, 512 x 512": (
-        Counts(size=262144, pixels=150000, lights=6, channels=3),
+    "colour, 512 x 512, on a busy machine": (
+        Counts(size=262144, pixels=143007, lights=6, channels=3),
         (3, 60),
-        (38.0, 12.0, 23.0),
-        [27.0, 28.0, 184.0, 74.0, 101.0, 173.0, 144.0, 298.0, 171.0, 142.0, 22.0],
+        (64.5, 14.1, 30.3),
+        [31.5, 19.7, 142.4, 79.9, 109.4, 120.6, 64.5, 92.8, 40.7, 43.0, 32.5],
     ),
 }
 
@@ -200,9 +194,12 @@ def test_runs_that_were_timed_are_told_within_a_factor_of_two(name, slowness):
 
 @pytest.mark.slow
 def test_time_left_of_a_real_fit(tmp_path):
-    """The last tenth of its time is not asked about: what is left then is within a second."""
+    """By processor time, since other work on the machine is none of the estimate's.
+
+    The last tenth of it is not asked about: what is left then is within a second.
+    """
     run_simulate(SimulateJob(object=ObjectSettings(name="wax", size_px=96), out=str(tmp_path / "capture")))
-    left, seen, began_s = TimeLeft(), [], time.monotonic()
+    left, seen, began_s = TimeLeft(time.process_time), [], time.process_time()
 
     class Watch:
         def expect(self, ahead):
@@ -210,10 +207,10 @@ def test_time_left_of_a_real_fit(tmp_path):
 
         def __call__(self, stage, done, total):
             left(stage, done, total)
-            seen.append((time.monotonic() - began_s, left.left_s()))
+            seen.append((time.process_time() - began_s, left.left_s()))
 
     run_fit(FitJob(capture=str(tmp_path / "capture"), out=str(tmp_path / "result")), Watch())
-    seen.append((time.monotonic() - began_s, None))
+    seen.append((time.process_time() - began_s, None))
     begun_s = 0.1 * seen[-1][0]
     share = within_two([pair for pair in seen if pair[0] >= begun_s], skip_s=0.1 * seen[-1][0])
     print(f"{seen[-1][0]:.0f} s: within a factor of two for {100 * share:.0f} % of the time")

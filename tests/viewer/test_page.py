@@ -79,11 +79,13 @@ def test_the_job_writes_beside_the_result_and_says_how_exact_it_is(result, tmp_p
     result(size=16, n_d=1.0).save(tmp_path / "two")
     said = run_view(ViewJob(result=str(tmp_path / "one")))
     assert (tmp_path / "one" / "view.html").is_file()
-    assert re.search(r"one: basis lights \d+\.\d dB from the result, 100\.00 %", said)
+    # One result goes by its object's name, two by their folders'.
+    assert re.search(r"bumps: basis lights \d+\.\d dB from the result, 100\.00 %", said)
     with pytest.raises(ResultError, match=r"view\.html: exists"):
         run_view(ViewJob(result=str(tmp_path / "one")))
     out = str(tmp_path / "both.html")
     said = run_view(ViewJob(result=str(tmp_path / "one"), other=str(tmp_path / "two"), out=out))
+    assert "one: basis lights" in said
     assert "two: basis lights" in said
     with pytest.raises(SettingsError, match="is the result itself"):
         run_view(ViewJob(result=str(tmp_path / "one"), other=str(tmp_path / "one"), out=str(tmp_path / "c.html")))
