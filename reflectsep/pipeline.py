@@ -9,7 +9,8 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ from reflectsep.config import (
     ViewJob,
 )
 from reflectsep.data import Capture, Light, PhotometricStack, Scattering
-from reflectsep.errors import ReflectsepError, ResultError, SettingsError
+from reflectsep.errors import FitError, LightError, ReflectsepError, ResultError, SettingsError, SweepError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
 from reflectsep.io import calibration as calibration_file
@@ -96,7 +97,30 @@ def fit(
         ReflectsepError: whatever makes the capture unfit, in one line that names the file.
     """
     settings, scatter = changed(settings or FitSettings(), changes), scatter or ScatterSettings()
-    calibration = calibration or CalibrationSettings()
+    with naming(capture.folder):
+        return separated(capture, settings, scatter, calibration or CalibrationSettings(), heldout, progress)
+
+
+@contextmanager
+def naming(folder: Path) -> Iterator[None]:
+    """Errors that name no file, as of the lights or of a whole sweep, name the capture's folder."""
+    try:
+        yield
+    except (LightError, SweepError, FitError) as error:
+        if str(folder) in str(error):
+            raise
+        raise type(error)(f"{folder}: {error}") from error
+
+
+def separated(
+    capture: Capture,
+    settings: FitSettings,
+    scatter: ScatterSettings,
+    calibration: CalibrationSettings,
+    heldout: Sequence[str],
+    progress: Progress,
+) -> Separation:
+    """The stages of `fit`, one after the other."""
     clock = Clock()
     capture, used = with_calibration(capture, calibration.file)
     capture = without(capture, heldout)
