@@ -115,10 +115,12 @@ def jacobians(
     pull = obs.weight
     if bool(obs.clipped.any()):
         pull = torch.where(obs.clipped & (r[:, : channels * lights].view_as(obs.clipped) == 0), 0.0, obs.weight)
-    J = picture_columns(x, pull, body, shine, obs.alpha, local.shape[1])
-    rows = [J, prior_columns(x, shared, obs, priors, local.shape[1])]
+    J = r.new_zeros(*r.shape, local.shape[1])
+    pictures, expectations = J[:, : channels * lights], J[:, channels * lights :]
+    fill_pictures(pictures.view(pixels, channels, lights, -1), x, pull, body, shine, obs.alpha)
+    fill_priors(expectations, x, shared, obs, priors)
     if not with_shared:
-        return r, torch.cat(rows, 1), None
+        return r, J, None
     K = r.new_zeros(pixels, r.shape[1], len(SHARED_NAMES))
     pictures = K[:, : channels * lights].view(pixels, channels, lights, -1)
     pictures[..., :3] = (pull * shine.by_u[:, None])[..., None] * obs.alpha
@@ -133,37 +135,36 @@ def jacobians(
     v = normalised_lobe(x, shared)
     K[:, lobe : lobe + 3, LOG_C_2] = -priors.lobe_weight[:, None] * v
     K[:, lobe + 3 : lobe + 6, LOG_C_2] = -priors.facing_weight[:, None] * across(v, priors.facing)
-    return r, torch.cat(rows, 1), K
+    return r, J, K
 
 
-def picture_columns(
-    x: Locals, pull: Tensor, body: BodySlopes, shine: LobeSlopes, alpha: Tensor, P: int
-) -> Float[Tensor, "pixels pictures P"]:
-    """Derivatives of the weighted pictures by a pixel's unknowns."""
-    pixels, channels, lights = pull.shape
-    J = pull.new_empty(pixels, channels, lights, P)
+def fill_pictures(
+    J: Float[Tensor, "pixels channels lights P"],
+    x: Locals,
+    pull: Tensor,
+    body: BodySlopes,
+    shine: LobeSlopes,
+    alpha: Tensor,
+) -> None:
+    """Derivatives of the weighted pictures by a pixel's unknowns, into the zeros of J."""
+    channels = pull.shape[1]
     by_lobe = pull * (shine.by_u * x.B[:, None])[:, None]
     by_body = (pull * body.by_root)[..., None] * alpha
-    J[..., : 3 * channels] = ((by_lobe / channels)[..., None] * alpha).repeat(1, 1, 1, channels)
+    J[..., : 3 * channels].unflatten(-1, (channels, 3)).copy_(((by_lobe / channels)[..., None] * alpha)[..., None, :])
     J[..., 3 * channels] = by_lobe * (x.d.mean(1) @ alpha.mT)[:, None]
-    if x.s is not None:
-        J[..., 3 * channels + 1 :] = 0.0
     for c in range(channels):
         J[:, c, :, 3 * c : 3 * c + 3] += by_body[:, c]
         if x.s is not None:
             at = 3 * channels + 1 + 3 * c
             J[:, c, :, at : at + 3] = by_body[:, c]
-    return J.flatten(1, 2)
 
 
-def prior_columns(
-    x: Locals, shared: Tensor, obs: Observations, priors: Priors, P: int
-) -> Float[Tensor, "pixels rows P"]:
-    """Derivatives of the priors' rows by a pixel's unknowns, in the order of `pixel_residual`."""
-    pixels, channels, _ = x.d.shape
+def fill_priors(
+    J: Float[Tensor, "pixels rows P"], x: Locals, shared: Tensor, obs: Observations, priors: Priors
+) -> None:
+    """Derivatives of the priors' rows by a pixel's unknowns, in the order of `pixel_residual`, into the zeros of J."""
+    channels = x.d.shape[1]
     three, log_B = 3 * channels, 3 * channels
-    own = 0 if x.s is None else three
-    J = x.d.new_zeros(pixels, 1 + three + 1 + 3 + 3 + own, P)
     mean = x.d.mean(1)
     J[:, 0, :three] = (priors.shape / channels * shape_slope(mean, obs)).repeat(1, channels)
     J[:, 0, log_B] = priors.shape
@@ -197,6 +198,5 @@ def prior_columns(
     J[:, facing : facing + 3, log_B] = strength * across(v, priors.facing)
     off = eye - priors.facing[:, :, None] * priors.facing[:, None, :]
     J[:, facing : facing + 3, :three] = ((strength * share[:, None])[..., None] * off).repeat(1, 1, channels)
-    if own:
-        J[:, facing + 3 :, three + 1 :] = torch.diag_embed(priors.s_weight[:, None].expand(-1, three))
-    return J
+    if x.s is not None:
+        J[:, facing + 3 :, three + 1 :].diagonal(dim1=1, dim2=2).copy_(priors.s_weight[:, None].expand(-1, three))

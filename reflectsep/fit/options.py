@@ -36,5 +36,5 @@ class FitOptions:
     tolerance: float = 1e-6
     globals_pixels: int = 300
     chunk: int = 1 << 12
-    """Pixels at once: what stays in the cache is twice as fast as what does not."""
+    """Pixels times channels at once: what stays in the cache is twice as fast as what does not."""
     dtype: Literal["float32", "float64"] = "float64"

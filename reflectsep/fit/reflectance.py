@@ -53,7 +53,7 @@ from reflectsep.fit.state import State
 from reflectsep.flags import Flag
 from reflectsep.model import diffuse
 from reflectsep.progress import Progress, silent
-from reflectsep.solve.joint import JointOptions
+from reflectsep.solve.joint import JointOptions, costs_in_chunks
 from reflectsep.solve.local import Termination
 
 HUBER = 5.0
@@ -172,11 +172,9 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)
     free = torch.tensor([True, True, True, options.n_s is None, True, False, False, options.refine_n_d])
     polish = Termination(tolerance=options.tolerance * 1e-2, max_iterations=60)
-    effort = Effort(
-        polish=polish,
-        joint=JointOptions(max_iterations=options.max_iterations, tolerance=options.tolerance, chunk=options.chunk),
-        chunk=options.chunk,
-    )
+    chunk = -(-options.chunk // obs.channels)
+    joint = JointOptions(max_iterations=options.max_iterations, tolerance=options.tolerance, chunk=chunk)
+    effort = Effort(polish=polish, joint=joint, chunk=chunk)
     nothing = LocalFit(obs.images[:, 0, :1], obs.images[:, 0, 0], obs.images[:, 0, 0], obs.clipped[:, 0, 0])
     return State(
         obs=obs,
@@ -320,7 +318,7 @@ def replace_local(found: LocalFit, local: Tensor) -> LocalFit:
 def rescored(state: State) -> State:
     """Costs at the present parameters and priors."""
     problem = build_problem(state.obs, state.priors, robust=state.robust)
-    cost = problem.costs(state.found.local, state.shared)
+    cost = costs_in_chunks(problem, state.found.local, state.shared, state.effort.chunk)
     shift = cost - state.found.cost
     found = LocalFit(state.found.local, cost, state.found.runner_up + shift.nan_to_num(0.0), state.found.converged)
     return replace(state, found=found)

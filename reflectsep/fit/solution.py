@@ -31,6 +31,8 @@ Report = Callable[[int, int], None]
 
 SAME_LOBE = 0.02
 """Lobes that differ by less, relatively, are one start."""
+SAME_WAY = 0.02
+"""Globals this close (none differs by more) end in the same place."""
 UNSEEN = 0.1
 """Highlights below this many standard deviations of the noise do not lead a pixel anywhere."""
 
@@ -133,9 +135,9 @@ def fit_globals(
     minimum outweighs a hundred good ones.
     """
     number = max(4, int(effort.trim * len(obs)))
-    results = []
+    results, passed = [], []
     for i, trial in enumerate(starts):
-        shared = trial
+        shared, way = trial, []
         for _ in range(effort.rounds):
             found = fit_locals(obs, priors, shared, effort, robust)
             keep = found.cost.argsort()[:number]
@@ -143,12 +145,20 @@ def fit_globals(
             joint = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
             moved = float((joint.shared - shared).abs().max())
             shared = joint.shared
-            if moved < 1e-3:
+            way.append(shared)
+            if moved < 1e-3 or met(shared, passed):
                 break
-        found = fit_locals(obs, priors, shared, effort, robust)
-        results.append((float(found.cost.sort().values[:number].sum()), i, shared))
+        if not met(shared, passed):
+            found = fit_locals(obs, priors, shared, effort, robust)
+            results.append((float(found.cost.sort().values[:number].sum()), i, shared))
+        passed += way
         report(i + 1, len(starts))
     return min(results, key=lambda entry: entry[:2])[2]
+
+
+def met(shared: Float[Tensor, "8"], passed: Sequence[Float[Tensor, "8"]]) -> bool:
+    """Whether an earlier start came by here, and so leads where this one would."""
+    return any(float((shared - place).abs().max()) < SAME_WAY for place in passed)
 
 
 def fit_everything(
