@@ -306,13 +306,8 @@ def joint_step(state: State, stage: str, progress: Progress) -> State:
         lambda done, limit: progress(stage, done, limit),
     )
     progress(stage, total, total)
-    found = replace_local(state.found, joint.local)
+    found = replace(state.found, local=joint.local, converged=joint.settled)
     return rescored(replace(state, shared=joint.shared, joint=joint, found=found))
-
-
-def replace_local(found: LocalFit, local: Tensor) -> LocalFit:
-    """`found` at other local parameters."""
-    return LocalFit(local, found.cost, found.runner_up, found.converged)
 
 
 def rescored(state: State) -> State:
@@ -320,7 +315,7 @@ def rescored(state: State) -> State:
     problem = build_problem(state.obs, state.priors, robust=state.robust)
     cost = costs_in_chunks(problem, state.found.local, state.shared, state.effort.chunk)
     shift = cost - state.found.cost
-    found = LocalFit(state.found.local, cost, state.found.runner_up + shift.nan_to_num(0.0), state.found.converged)
+    found = replace(state.found, cost=cost, runner_up=state.found.runner_up + shift.nan_to_num(0.0))
     return replace(state, found=found)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -180,16 +180,15 @@ def fit_everything(
     joint = solve_joint(
         problem.take(vote), found.local[vote], shared, effort.joint, free=free, watch=lambda i, _: report(i, total)
     )
-    local = found.local.clone()
-    local[vote] = joint.local
+    local, settled = found.local.clone(), found.converged.clone()
+    local[vote], settled[vote] = joint.local, joint.settled
     rest = torch.ones(len(obs), dtype=torch.bool)
     rest[vote] = False
     index = rest.nonzero()[:, 0]
     if len(index):
-        local[index] = local_in_chunks(
-            problem.take(index), local[index], joint.shared, effort.polish, effort.chunk
-        ).local
-    return JointSolution(**{**joint.__dict__, "local": local})
+        others = local_in_chunks(problem.take(index), local[index], joint.shared, effort.polish, effort.chunk)
+        local[index], settled[index] = others.local, others.converged
+    return replace(joint, local=local, settled=settled)
 
 
 def hand_on_lobes(

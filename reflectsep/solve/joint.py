@@ -22,6 +22,9 @@ from torch import Tensor
 from reflectsep.solve.local import LocalSolution, Termination, normal_equations, solve_local
 from reflectsep.solve.problem import BlockProblem, robust_weight
 
+MOST_DAMPING = 1e8
+"""Where no step is short enough to lower the cost, there is none."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class JointOptions:
@@ -48,6 +51,8 @@ class JointSolution:
     """S: inverse covariance of the shared parameters, the blocks marginalised."""
     iterations: int
     converged: bool
+    settled: Bool[Tensor, "blocks"]
+    """Of every block: its own iterations have come to their end at the final shared parameters."""
     history: tuple[float, ...]
 
 
@@ -173,14 +178,16 @@ def solve_joint(
     # Not the blocks first: under shared parameters that are off, their ends are further off, and in wrong minima.
     cost = float(costs_in_chunks(problem, local, shared, options.chunk).sum() + problem.shared_cost(shared))
     history, mu, converged, iteration = [cost], options.damping, False, 0
+    settled = torch.zeros(len(local), dtype=torch.bool, device=local.device)
     system = reduced_system(problem, local, shared, options.chunk)
     while not converged and iteration < options.max_iterations:
         iteration += 1
         better: tuple[Tensor, Tensor, float] | None = None
-        while better is None and mu < 1e8:
+        while better is None and mu < MOST_DAMPING:
             step = shared_step(system, mu, free)
             moved = follow(problem, local, shared, step, options.chunk)
             trial = local_in_chunks(problem, moved, shared + step, options.inner, options.chunk)
+            settled = trial.converged
             trial_cost = float(trial.cost.sum() + problem.shared_cost(shared + step))
             if trial_cost < cost:
                 better = trial.local, shared + step, trial_cost
@@ -203,5 +210,6 @@ def solve_joint(
         information=system.S,
         iterations=iteration,
         converged=converged,
+        settled=settled,
         history=tuple(history),
     )

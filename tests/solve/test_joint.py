@@ -8,6 +8,7 @@ from reflectsep.solve.joint import (
     follow,
     inverse,
     local_in_chunks,
+    promised,
     reduced_system,
     shared_step,
     solve_joint,
@@ -143,6 +144,31 @@ def test_the_optimum_has_no_gradient():
     H, gradient = dense_system(problem, found.local, found.shared)
     # In standard deviations of the parameters.
     assert float((gradient * torch.linalg.inv(H).diagonal().sqrt()).abs().max()) < 1e-4
+
+
+def test_blocks_say_whether_they_came_to_their_end():
+    problem, truth, shared = curves(noise=0.1)
+    step = shared + torch.tensor([0.05, -0.05], dtype=torch.float64)
+    whole = solve_joint(problem, truth + 0.1, step)
+    assert bool(whole.settled.all())
+    hurried = solve_joint(
+        problem, truth + 0.1, step, JointOptions(inner=Termination(max_iterations=1), max_iterations=1)
+    )
+    assert not bool(hurried.settled.any())
+
+
+def test_it_stops_where_no_step_promises_more_than_the_tolerance():
+    problem, truth, shared = curves(noise=0.1)
+    rough = solve_joint(problem, truth, shared + 0.1, JointOptions(tolerance=1e-2))
+    fine = solve_joint(problem, truth, shared + 0.1, JointOptions(tolerance=1e-12))
+    assert rough.converged
+    assert fine.converged
+    assert rough.iterations < fine.iterations
+    assert promised(reduced_system(problem, rough.local, rough.shared, 100), None) <= 1e-2 * rough.cost
+    assert promised(reduced_system(problem, fine.local, fine.shared, 100), None) <= 1e-12 * fine.cost
+    # What is promised at the rough end is what the fine one gains, to second order.
+    gain = rough.cost - fine.cost
+    assert promised(reduced_system(problem, rough.local, rough.shared, 100), None) == pytest.approx(gain, rel=0.2)
 
 
 @pytest.mark.parametrize("held", [0, 1])
