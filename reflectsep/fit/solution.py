@@ -82,15 +82,16 @@ def fit_chunk(obs: Observations, priors: Priors, shared: Tensor, effort: Effort,
     """`fit_locals` on one chunk."""
     candidates = scan(obs, priors, shared, keep=effort.minima)
     problem = build_problem(obs, priors, robust=robust)
+    # All minima in one batch: of few pixels the calls take longer than the arithmetic.
+    k, pixel = candidates.cost.T.isfinite().nonzero(as_tuple=True)
+    start = pack_start(obs.take(pixel), candidates.d[pixel, k], candidates.log_B[pixel, k])
+    ends = local_in_chunks(problem.take(pixel), start, shared, effort.polish, effort.chunk)
     best: LocalFit | None = None
-    for k in range(effort.minima):
-        exists = candidates.cost[:, k].isfinite()
-        which = exists.nonzero()[:, 0]
-        if len(which) == 0:
-            continue
-        start = pack_start(obs.take(which), candidates.d[which, k], candidates.log_B[which, k])
-        part = local_in_chunks(problem.take(which), start, shared, effort.polish, effort.chunk)
-        best = merge(best, which, part.local, part.cost, part.converged, len(obs))
+    for i in range(effort.minima):
+        which = k == i
+        if bool(which.any()):
+            end = ends.local[which], ends.cost[which], ends.converged[which]
+            best = merge(best, pixel[which], *end, len(obs))
     assert best is not None  # every scan has a minimum
     return best
 
