@@ -29,6 +29,14 @@ class FitError(ReflectsepError):
     """A fit that has nothing to stand on: no pixels, too few pictures, no finite cost."""
 
 
+class WorkerError(ReflectsepError):
+    """Another process of a shared run is gone, or does not answer."""
+
+
+class SaidElsewhereError(ReflectsepError):
+    """What stopped this process of a shared run has been said by another one."""
+
+
 class MissingExtraError(ReflectsepError):
     """An optional dependency is needed and not installed."""
 

@@ -63,6 +63,7 @@ from reflectsep.scatter.measure import measure_scattering
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.separation import Separation, load, separate
 from reflectsep.settings import nearest
+from reflectsep.solve.sharing import workers
 from reflectsep.summary import capture_summary, describe, summary
 from reflectsep.workload import Counts, reading, reporting, solving
 
@@ -316,13 +317,17 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
     if job.lights_file is not None:
         document = {**separation.document, "lights_file": str(Path(job.lights_file).resolve())}
         separation = dataclasses.replace(separation, document=document)
-    separation.save(job.out, overwrite=job.overwrite, previews=previews(separation))
+    first = workers().first  # of a shared run one process writes
+    if first:
+        separation.save(job.out, overwrite=job.overwrite, previews=previews(separation))
     said = f"{job.out}: {summary(separation)}"
+    baseline = None
+    if job.report and job.baseline and bool(separation.s.any()):
+        baseline = lin_lee_beside(separation, capture, job.fit, journal)
+    if not first:
+        return said
     if job.report:
         out = Path(job.out) / "report.html"
-        baseline = None
-        if job.baseline and bool(separation.s.any()):
-            baseline = lin_lee_beside(separation, capture, job.fit, journal)
         rows = held_out_rows(separation, baseline or separation, capture)
         presentation.report(out, separation, capture, result=job.out, baseline=baseline, heldout=rows, progress=journal)
         said += f"\n  report    {out}"

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import reflectsep
 from reflectsep.cli.help import job_help, overview
 from reflectsep.config import JOBS
-from reflectsep.errors import ReflectsepError, SettingsError
+from reflectsep.errors import ReflectsepError, SaidElsewhereError, SettingsError
 from reflectsep.settings import nearest
 
 FAILED = 1
@@ -67,6 +67,10 @@ def complain(error: Exception, where: str = "") -> int:
     Returns:
         Exit code.
     """
+    if isinstance(error, SaidElsewhereError):
+        return FAILED
+    if isinstance(error, SettingsError) and os.environ.get("RANK", "0") != "0":
+        return USAGE  # the processes of a shared run have the same settings; the first says it
     text = " ".join(str(error).split())
     print(f"reflectsep: error: {where}{text}", file=sys.stderr, flush=True)
     return USAGE if isinstance(error, SettingsError) else FAILED

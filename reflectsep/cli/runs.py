@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -20,7 +21,7 @@ from reflectsep.cli.command import complain
 from reflectsep.cli.overrides import build, checked, expanded, flat, hydra_ready, settings_of, swept
 from reflectsep.config import Job
 from reflectsep.errors import ReflectsepError, SettingsError
-from reflectsep.progress import shown
+from reflectsep.progress import shown, silent
 
 _QUIET = (
     "hydra/job_logging=none",
@@ -103,11 +104,31 @@ def _task(job: str, keys: frozenset[str], lines: bool, config: DictConfig) -> in
 def _run(job: str, settings: Job, where: str = "", *, parallel: bool = False, lines: bool = False) -> int:
     from reflectsep import pipeline
 
-    with shown(where, parallel=parallel, lines=lines) as progress:
-        text = getattr(pipeline, f"run_{job}")(settings, progress)
-    if text:
-        print(text, flush=True)
-    return getattr(text, "exit_code", 0)  # what a check says of the capture
+    with _crew(job) as first:
+        run = getattr(pipeline, f"run_{job}")
+        if not first:  # another process of this run shows what is done, and writes it
+            run(settings, silent)
+            return 0
+        with shown(where, parallel=parallel, lines=lines) as progress:
+            text = run(settings, progress)
+        if text:
+            print(text, flush=True)
+        return getattr(text, "exit_code", 0)  # what a check says of the capture
+
+
+@contextmanager
+def _crew(job: str) -> Iterator[bool]:
+    """The processes that share a fit, where `torchrun` has started several; gives whether this is the first."""
+    count = os.environ.get("WORLD_SIZE", "1")
+    if count == "1":
+        yield True
+        return
+    if job != "fit":
+        raise SettingsError(f"{job}: only fit shares its work among processes ({count} were started)")
+    from reflectsep.solve.sharing import shared_work
+
+    with shared_work() as crew:
+        yield crew.first
 
 
 def _codes(batches: Any) -> Iterable[int]:

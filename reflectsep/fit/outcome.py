@@ -22,6 +22,7 @@ from reflectsep.flags import Flag, mark
 from reflectsep.solve.joint import inverse, reduced_system
 from reflectsep.solve.local import normal_equations
 from reflectsep.solve.problem import robust_weight
+from reflectsep.solve.sharing import by_chunks
 
 AMBIGUOUS_COST = 2.0
 """Two solutions whose costs differ by less are not told apart by the pictures."""
@@ -98,9 +99,9 @@ def local_deviation(state: State, covariance: Float[Tensor, "8 8"]) -> Float[Ten
 
     cov(l) = V^-1 + V^-1 W cov(g) W^T V^-1
     """
-    parts = []
-    for start in range(0, len(state.obs), state.effort.chunk):
-        index = torch.arange(start, min(start + state.effort.chunk, len(state.obs)))
+
+    def deviation(cut: slice) -> tuple[Tensor]:
+        index = torch.arange(cut.start, cut.stop)
         problem = build_problem(state.obs.take(index), state.priors.take(index), robust=state.robust)
         r, J, K = problem.linearise(state.found.local[index], state.shared)
         weight = robust_weight(r, problem.threshold)
@@ -108,8 +109,9 @@ def local_deviation(state: State, covariance: Float[Tensor, "8 8"]) -> Float[Ten
         V_inv = inverse(V)
         pull = V_inv @ (J.mT @ (K * weight[..., None]))
         variance = V_inv.diagonal(dim1=-2, dim2=-1) + torch.einsum("npg,gh,nph->np", pull, covariance, pull)
-        parts.append(variance.clamp_min(0.0).sqrt())
-    return torch.cat(parts)
+        return (variance.clamp_min(0.0).sqrt(),)
+
+    return by_chunks(len(state.obs), state.effort.chunk, deviation)[0]
 
 
 def final_flags(

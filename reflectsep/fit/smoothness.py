@@ -22,6 +22,7 @@ from reflectsep.fit.state import State
 from reflectsep.solve.joint import inverse
 from reflectsep.solve.local import normal_equations
 from reflectsep.solve.problem import robust_weight
+from reflectsep.solve.sharing import by_chunks
 
 SCALES_PX = (3.0, 2.0, 1.5, 1.0)
 """Widths of the windows, the widest first: patches in a wrong minimum are overruled from outside."""
@@ -57,9 +58,9 @@ def lobe_variance(state: State) -> Float[Tensor, "pixels"]:
     """Variance of the normalised lobe by each pixel's own pictures, the mean over its three components."""
     obs = state.obs
     priors = replace(state.priors, lobe_weight=torch.zeros_like(state.priors.lobe_weight))
-    parts = []
-    for start in range(0, len(obs), state.effort.chunk):
-        index = torch.arange(start, min(start + state.effort.chunk, len(obs)))
+
+    def variance(cut: slice) -> tuple[Tensor]:
+        index = torch.arange(cut.start, cut.stop)
         problem = build_problem(obs.take(index), priors.take(index), robust=state.robust)
         local = state.found.local[index]
         r, J = problem.linearise_local(local, state.shared)
@@ -70,8 +71,9 @@ def lobe_variance(state: State) -> Float[Tensor, "pixels"]:
             slope[:, k, k : 3 * obs.channels : 3] = x.B[:, None] / obs.channels
             slope[:, k, 3 * obs.channels] = x.B * x.d.mean(1)[:, k]
         slope = slope / state.shared[LOG_C_2].exp()
-        parts.append(torch.einsum("nkp,npq,nkq->n", slope, inverse(V), slope) / 3.0)
-    return torch.cat(parts)
+        return (torch.einsum("nkp,npq,nkq->n", slope, inverse(V), slope) / 3.0,)
+
+    return by_chunks(len(obs), state.effort.chunk, variance)[0]
 
 
 def clearly_seen(state: State, variance: Tensor) -> Bool[Tensor, "pixels"]:

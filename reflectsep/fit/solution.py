@@ -26,6 +26,7 @@ from reflectsep.fit.search import scan
 from reflectsep.model import lobe, lobe_argument, signed_root
 from reflectsep.solve.joint import JointOptions, JointSolution, local_in_chunks, solve_joint
 from reflectsep.solve.local import Termination
+from reflectsep.solve.sharing import by_chunks
 
 Report = Callable[[int, int], None]
 
@@ -71,11 +72,13 @@ def fit_locals(
     obs: Observations, priors: Priors, shared: Float[Tensor, "8"], effort: Effort, robust: float | None
 ) -> LocalFit:
     """Search over B, then LM from the best minima of every pixel, the globals held (the paper's second step)."""
-    parts = []
-    for start in range(0, len(obs), effort.chunk):
-        index = torch.arange(start, min(start + effort.chunk, len(obs)))
-        parts.append(fit_chunk(obs.take(index), priors.take(index), shared, effort, robust))
-    return LocalFit(*(torch.cat([getattr(p, name) for p in parts]) for name in LocalFit.__dataclass_fields__))
+
+    def fitted(cut: slice) -> tuple[Tensor, ...]:
+        index = torch.arange(cut.start, cut.stop)
+        part = fit_chunk(obs.take(index), priors.take(index), shared, effort, robust)
+        return part.local, part.cost, part.runner_up, part.converged
+
+    return LocalFit(*by_chunks(len(obs), effort.chunk, fitted))
 
 
 def fit_chunk(obs: Observations, priors: Priors, shared: Tensor, effort: Effort, robust: float | None) -> LocalFit:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from reflectsep.solve.local import LocalSolution, Termination, normal_equations, solve_local
 from reflectsep.solve.problem import BlockProblem, robust_weight
+from reflectsep.solve.sharing import by_chunks
 
 MOST_DAMPING = 1e8
 """Where no step is short enough to lower the cost, there is none."""
@@ -66,10 +67,8 @@ class ReducedSystem:
 
 def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: int) -> ReducedSystem:
     """S and the reduced gradient at (local, shared), chunk by chunk."""
-    G = len(shared)
-    S, gradient = shared.new_zeros(G, G), shared.new_zeros(G)
-    for start in range(0, len(local), chunk):
-        cut = slice(start, start + chunk)
+
+    def reduced(cut: slice) -> tuple[Tensor, Tensor]:
         part = problem.take(cut)
         r, J, K = part.linearise(local[cut], shared)
         weight = robust_weight(r, part.threshold)
@@ -77,8 +76,11 @@ def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: 
         weighted = K * weight[..., None]
         W = J.mT @ weighted
         V_inv = inverse(V)
-        S += torch.einsum("nmg,nmh->gh", weighted, K) - torch.einsum("npg,npq,nqh->gh", W, V_inv, W)
-        gradient += torch.einsum("nmg,nm->g", weighted, r) - torch.einsum("npg,npq,nq->g", W, V_inv, gl)
+        S = torch.einsum("nmg,nmh->gh", weighted, K) - torch.einsum("npg,npq,nqh->gh", W, V_inv, W)
+        gradient = torch.einsum("nmg,nm->g", weighted, r) - torch.einsum("npg,npq,nq->g", W, V_inv, gl)
+        return S[None], gradient[None]
+
+    S, gradient = (parts.sum(0) for parts in by_chunks(len(local), chunk, reduced))
     if problem.shared_residual is not None:
         q = problem.shared_residual(shared)
         # In single precision, zero tangents come back from torch in double.
@@ -126,40 +128,36 @@ def follow(problem: BlockProblem, local: Tensor, shared: Tensor, step: Tensor, c
     Along a flat valley (here: a against B) blocks that wait for their own iterations would make every shared step
     look bad.
     """
-    result = local.clone()
-    for start in range(0, len(local), chunk):
-        cut = slice(start, start + chunk)
-        part = problem.take(cut)
-        r, J, K = part.linearise(local[cut], shared)
+
+    def moved(cut: slice) -> tuple[Tensor]:
+        part, here = problem.take(cut), local[cut]
+        r, J, K = part.linearise(here, shared)
         weight = robust_weight(r, part.threshold)
         V, gl = normal_equations(r, J, weight)
         pull = gl + (J.mT @ (weight * (K @ step))[..., None])[..., 0]
-        moved = local[cut] - (inverse(V) @ pull[..., None])[..., 0]
-        better = part.costs(moved, shared + step) < part.costs(local[cut], shared + step)
-        result[cut] = torch.where(better[:, None], moved, local[cut])
-    return result
+        there = here - (inverse(V) @ pull[..., None])[..., 0]
+        better = part.costs(there, shared + step) < part.costs(here, shared + step)
+        return (torch.where(better[:, None], there, here),)
+
+    return by_chunks(len(local), chunk, moved)[0]
 
 
 def costs_in_chunks(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: int) -> Float[Tensor, "blocks"]:
     """Cost of every block, chunk by chunk."""
-    cuts = [slice(i, i + chunk) for i in range(0, len(local), chunk)]
-    return torch.cat([problem.take(cut).costs(local[cut], shared) for cut in cuts])
+    return by_chunks(len(local), chunk, lambda cut: (problem.take(cut).costs(local[cut], shared),))[0]
 
 
 def local_in_chunks(
     problem: BlockProblem, local: Tensor, shared: Tensor, termination: Termination, chunk: int
 ) -> LocalSolution:
     """`solve_local`, chunk by chunk."""
-    parts = [
-        solve_local(problem.take(slice(i, i + chunk)), local[i : i + chunk], shared, termination)
-        for i in range(0, len(local), chunk)
-    ]
-    return LocalSolution(
-        local=torch.cat([p.local for p in parts]),
-        cost=torch.cat([p.cost for p in parts]),
-        converged=torch.cat([p.converged for p in parts]),
-        iterations=max(p.iterations for p in parts),
-    )
+
+    def solved(cut: slice) -> tuple[Tensor, ...]:
+        part = solve_local(problem.take(cut), local[cut], shared, termination)
+        return part.local, part.cost, part.converged, torch.tensor([part.iterations])
+
+    places, cost, converged, iterations = by_chunks(len(local), chunk, solved)
+    return LocalSolution(local=places, cost=cost, converged=converged, iterations=int(iterations.max()))
 
 
 def solve_joint(

@@ -1,0 +1,146 @@
+"""Work on blocks chunk by chunk, alone or shared among the processes of one run.
+
+Every process knows the whole problem; chunks go to the processes in turn, and what each finds is handed to all of
+them. Results stand in the order of the chunks and sums are formed from those of the chunks in that order, so that N
+processes give the same numbers as one, bit for bit: along a flat valley, rounding alone would lead them apart.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from reflectsep.errors import ReflectsepError, SaidElsewhereError, WorkerError
+
+PATIENCE = timedelta(minutes=30)
+"""How long a process waits for the others. One that dies is noticed at once; this is for one that hangs."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The processes of this run, and which of them this is."""
+
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the process that writes and speaks."""
+        return self.rank == 0
+
+
+_ALONE = Workers()
+_workers: ContextVar[Workers] = ContextVar("workers", default=_ALONE)
+
+
+def workers() -> Workers:
+    """The processes that share chunks here; within a chunk, and unless `shared_work` says so, this one alone."""
+    return _workers.get()
+
+
+@contextmanager
+def shared_work(environment: Mapping[str, str] = os.environ) -> Iterator[Workers]:
+    """Share chunks among the processes that `torchrun` has started; just this one where it has started none.
+
+    Raises:
+        WorkerError: another process is gone, or does not answer.
+        SaidElsewhereError: instead of any other error of ours, in all processes but the one that is to say it.
+    """
+    if int(environment.get("WORLD_SIZE", "1")) == 1:
+        yield _ALONE
+        return
+    import torch.distributed as dist
+    from torch.distributed.rendezvous import rendezvous
+
+    store, rank, count = next(rendezvous("env://", timeout=PATIENCE))
+    dist.init_process_group("gloo", store=store, rank=rank, world_size=count, timeout=PATIENCE)
+    token = _workers.set(Workers(rank, count))
+    try:
+        yield _workers.get()
+    except ReflectsepError as error:
+        if _said(store):
+            raise SaidElsewhereError(str(error)) from error
+        raise
+    finally:
+        _workers.reset(token)
+        dist.destroy_process_group()
+
+
+def _said(store: Any) -> bool:
+    """Whether another process has begun to say what stopped the run; the one that asks first has not."""
+    try:
+        return store.add("errors", 1) > 1
+    except RuntimeError:  # the process that kept the count is gone
+        return False
+
+
+def by_chunks(count: int, chunk: int, work: Callable[[slice], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+    """What `work` gives for every chunk of 0 .. count - 1, joined along the first dimension in the chunks' order.
+
+    Args:
+        count: blocks in all, at least one.
+        chunk: blocks at once.
+        work: from a chunk to tensors; the same number of them, with the same trailing shapes, for all chunks.
+
+    Raises:
+        WorkerError: another process of the run is gone.
+    """
+    cuts = [slice(i, min(i + chunk, count)) for i in range(0, count, chunk)]
+    crew = workers()
+    if crew.count > len(cuts):
+        crew = _ALONE  # not one for each: then everybody does all of it, which is as quick
+    token = _workers.set(_ALONE)
+    try:
+        own = [work(cut) for cut in cuts[crew.rank :: crew.count]]
+    finally:
+        _workers.reset(token)
+    columns = list(zip(*own, strict=True))
+    if crew.count == 1:
+        return tuple(torch.cat(parts) for parts in columns)
+    return tuple(_gather(list(parts), crew, len(cuts)) for parts in columns)
+
+
+def _gather(own: list[Tensor], crew: Workers, chunks: int) -> Tensor:
+    """Every chunk's tensor, in order, on all processes."""
+    import torch.distributed as dist
+
+    rows = torch.zeros(chunks, dtype=torch.int64)
+    rows[crew.rank :: crew.count] = torch.tensor([len(part) for part in own])
+    mine = torch.cat(own)
+    kind = mine.dtype
+    if kind == torch.bool:
+        mine = mine.to(torch.uint8)
+    try:
+        dist.all_reduce(rows)
+        totals = [int(rows[rank :: crew.count].sum()) for rank in range(crew.count)]
+        padded = mine.new_zeros(max(totals), *mine.shape[1:])
+        padded[: len(mine)] = mine
+        gathered = [torch.empty_like(padded) for _ in totals]
+        dist.all_gather(gathered, padded)
+    except RuntimeError as error:
+        raise WorkerError(f"another process of this run is gone or does not answer ({_reason(error)})") from error
+    result = mine.new_empty(int(rows.sum()), *mine.shape[1:])
+    starts = [0, *rows.cumsum(0).tolist()]
+    for rank, part in enumerate(gathered):
+        at = 0
+        for i in range(rank, chunks, crew.count):
+            length = starts[i + 1] - starts[i]
+            result[starts[i] : starts[i + 1]] = part[at : at + length]
+            at += length
+    return result.to(kind)
+
+
+def _reason(error: RuntimeError) -> str:
+    """What broke, without the library's place in its own source and its advice."""
+    text = str(error)
+    if text.startswith("["):  # [FILE:LINE] what broke. Advice.
+        text = text.split("] ", 1)[-1]
+    return text.split(". ")[0].split("\n")[0] or type(error).__name__

@@ -1,0 +1,115 @@
+"""Chunks shared among processes: the same numbers as alone, and no process that waits for a dead one."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+from reflectsep.errors import SaidElsewhereError, WorkerError
+from reflectsep.solve.sharing import by_chunks, shared_work, workers
+
+WORKER = """
+import os, sys
+import torch
+from reflectsep.errors import FitError, ReflectsepError
+from reflectsep.solve.sharing import by_chunks, shared_work, workers
+
+def work(cut):
+    assert workers().count == 1  # what is nested is not shared again
+    values = torch.arange(cut.start, cut.stop, dtype=torch.float64).sin()
+    return torch.stack([values, values.square()], 1), values > 0, values.sum()[None]
+
+with shared_work() as crew:
+    seen = []
+    def watched(cut):
+        seen.append(cut.start)
+        return work(cut)
+    pairs, positive, sums = by_chunks(23, 4, watched)
+    torch.save({"pairs": pairs, "positive": positive, "sums": sums, "seen": torch.tensor(seen)}, sys.argv[1])
+    few = by_chunks(3, 4, watched)
+    assert len(few[0]) == 3
+    if sys.argv[2] == "die" and crew.rank == 1:
+        os._exit(9)
+    try:
+        if sys.argv[2] == "raise":
+            raise FitError("no pixel")
+        by_chunks(23, 4, work)
+    except ReflectsepError as error:
+        print(type(error).__name__, error)
+        raise
+"""
+
+
+def run_two(folder: Path, what: str) -> list[subprocess.CompletedProcess[str]]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    running = []
+    for rank in range(2):
+        environment = os.environ | {
+            "RANK": str(rank),
+            "WORLD_SIZE": "2",
+            "MASTER_ADDR": "127.0.0.1",
+            "MASTER_PORT": str(port),
+            "OMP_NUM_THREADS": "1",
+        }
+        words = [sys.executable, "-c", WORKER, str(folder / f"{rank}.pt"), what]
+        running.append(
+            subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        )
+    ended = []
+    for process in running:
+        out, err = process.communicate(timeout=60)
+        ended.append(subprocess.CompletedProcess(process.args, process.returncode, out, err))
+    return ended
+
+
+def work(cut):
+    values = torch.arange(cut.start, cut.stop, dtype=torch.float64).sin()
+    return torch.stack([values, values.square()], 1), values > 0, values.sum()[None]
+
+
+def test_alone_chunks_are_joined_in_order():
+    pairs, positive, sums = by_chunks(23, 4, work)
+    everything = torch.arange(23, dtype=torch.float64).sin()
+    assert torch.equal(pairs[:, 0], everything)
+    assert torch.equal(positive, everything > 0)
+    torch.testing.assert_close(sums, torch.stack([part.sum() for part in everything.split(4)]))
+
+
+def test_without_other_processes_nothing_is_shared():
+    with shared_work({"WORLD_SIZE": "1"}) as crew:
+        assert crew.count == 1
+        assert crew.first
+    with shared_work({}):
+        assert workers().first
+
+
+def test_two_processes_give_every_bit_of_one_and_each_does_its_part(tmp_path):
+    ended = run_two(tmp_path, "share")
+    assert [process.returncode for process in ended] == [0, 0], ended[0].stderr + ended[1].stderr
+    found = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2)]
+    for name, alone in zip(("pairs", "positive", "sums"), by_chunks(23, 4, work), strict=True):
+        for result in found:
+            assert torch.equal(result[name], alone)
+            assert result[name].dtype == alone.dtype
+    assert found[0]["seen"].tolist() == [0, 8, 16]
+    assert found[1]["seen"].tolist() == [4, 12, 20]
+
+
+def test_a_process_that_dies_is_an_error_of_the_other(tmp_path):
+    survivor, dead = run_two(tmp_path, "die")
+    assert dead.returncode == 9
+    assert survivor.returncode != 0
+    assert survivor.stdout.startswith(f"{WorkerError.__name__} another process of this run is gone")
+    assert len(survivor.stdout.splitlines()) == 1
+
+
+def test_an_error_of_all_is_said_by_one(tmp_path):
+    ended = run_two(tmp_path, "raise")
+    assert all(process.returncode != 0 for process in ended)
+    quiet = [SaidElsewhereError.__name__ in process.stderr for process in ended]
+    assert sorted(quiet) == [False, True]
