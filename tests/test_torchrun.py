@@ -16,7 +16,7 @@ from reflectsep.separation import load
 
 pytestmark = pytest.mark.slow
 
-TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=0"]
+TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
 ENVIRONMENT = os.environ | {"OMP_NUM_THREADS": "1"}
 
 
@@ -35,7 +35,7 @@ def capture(tmp_path_factory):
 def test_two_processes_give_the_result_of_one_bit_for_bit(tmp_path, capture):
     subprocess.run([sys.executable, *fit_words(capture, tmp_path / "one")], env=ENVIRONMENT, check=True)
     words = [*TORCHRUN, *fit_words(capture, tmp_path / "two")]
-    shared = subprocess.run(words, env=ENVIRONMENT, check=True, capture_output=True, text=True)
+    shared = subprocess.run(words, env=ENVIRONMENT, check=True, capture_output=True, text=True, timeout=200)
     assert shared.stdout.count("Wu & Tang") == 1
     one, two = load(tmp_path / "one"), load(tmp_path / "two")
     for name in ("a", "n_s", "B", "d", "s", "specular", "flags", "d_sd"):
@@ -63,6 +63,6 @@ def test_a_killed_process_ends_the_run_with_nothing_written(tmp_path, capture):
 
 def test_only_a_fit_is_shared(capture):
     words = [*TORCHRUN, "-m", "reflectsep", "info", str(capture)]
-    ended = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    ended = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=100)
     assert ended.returncode != 0
     assert ended.stderr.count("reflectsep: error: info: only fit shares its work among processes") == 1
