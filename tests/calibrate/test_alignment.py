@@ -13,28 +13,13 @@ from reflectsep.calibrate.stack import calibrate_stack, develop_pictures
 from reflectsep.data import Frame, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.flags import Flag
-from reflectsep.io.capture import load_capture
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.stack import read_full, read_mask
 from reflectsep.synth.drift import Drift
-from reflectsep.synth.presets import make_object
-from reflectsep.synth.rig import SimulatedCamera, make_rig
-from reflectsep.synth.simulate import simulate
+
+from .conftest import simulated, truth
 
 EYE = torch.eye(3, dtype=torch.float64)
-
-
-def simulated(folder, name="pudding", drift=None, size=64, **camera):
-    rig = make_rig(
-        "r",
-        heldout=(0, 0),
-        sweeps=(3, 0),
-        slab_px=(8.0, 4.0),
-        camera=SimulatedCamera(full_sigma=0.005, frame_sigma=0.002, **camera),
-        drift=drift,
-    )
-    simulate(make_object(name, size=size), rig, folder, seed=3)
-    return load_capture(folder)
 
 
 def aligned(capture, options=None):
@@ -43,12 +28,6 @@ def aligned(capture, options=None):
     pictures, clipped = develop_pictures(capture, raw, response)
     streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
     return align(capture, raw.names, pictures, clipped, read_mask(capture), streams, options=options)
-
-
-def truth(capture, name):
-    document = json.loads((capture.folder / "truth" / "drift.json").read_text())[name]
-    matrix = torch.tensor(document["matrix"], dtype=torch.float64)
-    return Motion(matrix=matrix, velocity=tuple(document["velocity_px"]))
 
 
 @pytest.fixture(scope="module")
