@@ -130,6 +130,13 @@ class FitSettings:
     )
     n_s: float | None = setting(None, "exponent of the lobe; null: fitted", above=0.0, at_most=1000.0)
     refine_n_d: bool = setting(False, "fit n_d as a fifth global")
+    alpha_sd: float = setting(
+        0.0,
+        "uncertainty of stated alphas (directions in radians, relative intensities) within which they are refined by "
+        "the joint fit; 0: held",
+        at_least=0.0,
+        at_most=1.0,
+    )
     weights: Literal["paper", "noise"] = setting("paper", "of Eq. 22: the two lambdas, or each picture's noise")
     lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
     lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)

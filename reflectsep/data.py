@@ -249,6 +249,9 @@ class Fit:
     """Picture minus model, in the capture's units."""
     intensity: Float[Tensor, "lights"]
     """Of every light; d, s and B are for lights of unit intensity, a component is intensity times its power."""
+    alpha: Float[Tensor, "lights 3"] | None = None
+    """As the fit refined the stack's; None where it held them."""
+    alpha_sd: Float[Tensor, "lights 3"] | None = None
     flags: Int[Tensor, "height width"]
     noise: float
     """Standard deviation of one residual, in the capture's units."""
