@@ -68,9 +68,7 @@ def still_of(capture: Capture, options: AlignOptions | None) -> Still:
     return Still(grey=pictures[0].mean(0).double(), mask=read_mask(capture), options=options)
 
 
-def held_out_pictures(
-    capture: Capture, names: Sequence[str], options: AlignOptions | None = None
-) -> HeldOutPictures:
+def held_out_pictures(capture: Capture, names: Sequence[str], options: AlignOptions | None = None) -> HeldOutPictures:
     """Pictures of lights that a fit left out, developed and registered as its stack was.
 
     Args:
