@@ -104,6 +104,9 @@ class RigSettings:
         None, "of the camera's files, value ^ (1 / gamma); null: linear", above=0.0, at_most=10.0
     )
     headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
+    oversample: int = setting(
+        1, "patches along a pixel's side that are rendered and added up; 2 or more where the camera drifts", at_least=1
+    )
     drift_px: float = setting(0.0, "shift of the camera between a light's full picture and its sweep", at_least=0.0)
     drift_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
     drift_across_px: float = setting(0.0, "shift of the camera between the lights' full pictures", at_least=0.0)
