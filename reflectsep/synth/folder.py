@@ -32,8 +32,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedPictures:
-    """Noise-free pictures in the capture's units, with as many patches a pixel as the camera's `oversample` says: of
-    every light, held-out ones included."""
+    """Noise-free pictures in the capture's units: of every light, held-out ones included.
+
+    With as many patches along a pixel's side as the camera's `oversample` says.
+    """
 
     object: str
     mask: Bool[Tensor, "height width"]
