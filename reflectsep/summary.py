@@ -113,7 +113,10 @@ def capture_summary(capture: Capture) -> str:
     lines.append(f"  encoding  {capture.encoding.kind}")
     for sweep in capture.sweeps:
         lost = f", {len(sweep.lost)} lost" if sweep.lost else ""
-        lines.append(f"  sweep     {sweep.light} along {sweep.direction}: {sweep.count} frames{lost}, {sweep.kind}")
+        several = f" at {len(sweep.exposures)} exposures" if sweep.bracket else ""
+        lines.append(
+            f"  sweep     {sweep.light} along {sweep.direction}: {sweep.count} frames{several}{lost}, {sweep.kind}"
+        )
     if not capture.sweeps:
         lines.append("  sweeps    none: a fit of it is the model of Lin & Lee")
     return "\n".join(lines)
