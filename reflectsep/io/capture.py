@@ -58,7 +58,7 @@ def files(capture: Capture) -> Iterator[tuple[str, str, str | None]]:
     """
     for index, picture in enumerate(capture.images):
         yield picture.file, f"images[{index}]", picture.sha256
-    for index, sweep in enumerate(one for sweep in capture.sweeps for one in sweep.exposures):
+    for index, sweep in enumerate(one for listed in capture.sweeps for one in listed.exposures):
         place = f"sweeps[{index}]"
         if sweep.video is not None:
             yield sweep.video, place, sweep.sha256[0] if sweep.sha256 else None
