@@ -20,11 +20,13 @@ from torch import Tensor
 
 from reflectsep import bench, exporting, presentation, simulation
 from reflectsep import calibration as calibration_job
-from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, aligned_stream
+from reflectsep.calibrate.align_options import AlignOptions
+from reflectsep.calibrate.alignment import Alignment, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.heldout import HeldOutPictures, Still, held_out_pictures, still_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, without
-from reflectsep.checking import check_capture, draw, table
+from reflectsep.checking.check import check_capture
+from reflectsep.checking.display import draw, table
 from reflectsep.comparison import beside, compare_result, left_out
 from reflectsep.config import (
     CalibrateJob,

@@ -1,7 +1,7 @@
 """Pictures that a fit never saw, as it would have seen them: developed alike, and in the first basis picture's place.
 
 A camera that drifted between the other lights drifted before a held-out one too, and a picture that lies elsewhere is
-unlike any relit one. Its motion is found as that of any picture under another light (`alignment.across`), from measured
+unlike any relit one. Its motion is found as that of any picture under another light (`across_lights`), from measured
 pictures alone: by what is relit, the comparison would be made to agree with the model that it judges.
 """
 
@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.calibrate.alignment import AlignOptions, across
+from reflectsep.calibrate.across_lights import across
+from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.exposure import response_of
 from reflectsep.calibrate.motion import Motion, warp
 from reflectsep.calibrate.stack import check_names, develop_pictures

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from reflectsep.calibrate.alignment import AlignOptions
+from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.heldout import held_out_pictures, still_of
 from reflectsep.calibrate.motion import displacement
 from reflectsep.errors import CaptureError, LightError
