@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from reflectsep.calibrate.alpha import report_alpha
+from reflectsep.calibrate.ball import find_ball_circle
 from reflectsep.calibrate.bracket import estimate_response, fit_gamma
 from reflectsep.calibrate.chrome import (
     Circle,
@@ -19,7 +20,6 @@ from reflectsep.calibrate.chrome import (
     compare_lights,
     diffuse_lights,
     disc,
-    find_ball,
     find_circle,
 )
 from reflectsep.calibrate.intensity import joint_intensities
@@ -165,4 +165,4 @@ def _circle(given: list[float] | None, pictures: Tensor, mask: Tensor | None) ->
         if not bool(disc(circle, *pictures.shape[1:]).any()):
             raise LightError(f"circle={given}: no pixel of the picture is in it")
         return circle
-    return find_circle(find_ball(pictures) if mask is None else mask)
+    return find_ball_circle(pictures) if mask is None else find_circle(mask)

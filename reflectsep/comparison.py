@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reflectsep.calibrate.heldout import HeldOutPictures, Still
+from reflectsep.calibrate.motion import Motion
 from reflectsep.data import Capture
 from reflectsep.errors import CaptureError
 from reflectsep.export.harmonics import ptm_terms
@@ -25,17 +27,18 @@ def compare_result(
     ours: Separation,
     baseline: Separation,
     capture: Capture,
-    heldout: Sequence[str],
-    pictures: tuple[Tensor, Tensor] | None,
+    pictures: HeldOutPictures | None,
     out: Path,
+    *,
+    still: Still,
 ) -> str:
     """Draw the figure; returns its numbers as text.
 
-    `pictures` are the held-out lights' real pictures and which of their values are clipped. Pictures in the capture's
-    `heldout/` folder, of the lights in its `heldout.json`, are compared as well.
+    `pictures` are the held-out lights' real pictures, where the capture has any. Pictures in the capture's `heldout/`
+    folder, of the lights in its `heldout.json`, are compared as well, registered against `still`.
     """
     rows = [component_row(ours, baseline, i) for i in range(3)]
-    relit = left_out(ours, baseline, capture, heldout, pictures) + beside(ours, baseline, capture)
+    relit = left_out(ours, baseline, capture, pictures) + beside(ours, baseline, capture, still)
     write_comparison(out, rows, relit, mask=ours.mask, title=str(ours.document.get("object", "")))
     lines = [str(out)]
     for light in relit:
@@ -43,7 +46,7 @@ def compare_result(
         model = {"Lin & Lee": light.baseline}
         methods = model if baseline is ours else {"ours": light.ours} | model
         scores = [f"{name} {psnr(p, light.real, mask):5.1f} dB" for name, p in (methods | dict(light.others)).items()]
-        lines.append(f"  {light.light:12s} {', '.join(scores)}")
+        lines.append(f"  {light.light:12s} {', '.join(scores)}{light.note and '; ' + light.note}")
     return "\n".join([*lines, *truth_lines(ours, baseline, capture)])
 
 
@@ -61,24 +64,22 @@ def component_row(ours: Separation, baseline: Separation, i: int) -> ComparisonR
 
 
 def left_out(
-    ours: Separation,
-    baseline: Separation,
-    capture: Capture,
-    names: Sequence[str],
-    pictures: tuple[Tensor, Tensor] | None,
+    ours: Separation, baseline: Separation, capture: Capture, pictures: HeldOutPictures | None
 ) -> list[HeldOut]:
     """Lights of the capture that the fit was told to leave out."""
     if pictures is None:
         return []
-    mixes = alphas_for([capture.lights[name] for name in names], ours.light_vectors)
+    mixes = alphas_for([capture.lights[name] for name in pictures.names], ours.light_vectors)
     rows = []
-    for i, name in enumerate(names):
-        counts = ~pictures[1][i].any(0)
-        rows.append(held_out(name, pictures[0][i], ours, baseline, mixes[name], counts=counts))
+    for name, real, clipped, motion in zip(
+        pictures.names, pictures.values, pictures.clipped, pictures.motions, strict=True
+    ):
+        row = held_out(name, real, ours, baseline, mixes[name], counts=~clipped.any(0))
+        rows.append(replace(row, note=_undone(motion)))
     return rows
 
 
-def beside(ours: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:
+def beside(ours: Separation, baseline: Separation, capture: Capture, still: Still) -> list[HeldOut]:
     """Lights of `heldout.json`, whose pictures lie beside the capture in its own units."""
     listed = capture.folder / "heldout.json"
     if not listed.is_file() or ours.light_vectors is None:
@@ -92,8 +93,15 @@ def beside(ours: Separation, baseline: Separation, capture: Capture) -> list[Hel
             real, _ = read_picture(file)
             if real.shape != ours.d.shape[1:]:
                 raise CaptureError(f"{file}: {tuple(real.shape)}, but the result is {tuple(ours.d.shape[1:])}")
-            rows.append(held_out(name, real, ours, baseline, mix, counts=real.isfinite().all(0)))
+            finite = torch.isfinite(real)
+            real, bad, motion = still.place(torch.where(finite, real, 0.0), ~finite)
+            row = held_out(name, real, ours, baseline, mix, counts=~bad.any(0))
+            rows.append(replace(row, note=_undone(motion)))
     return rows
+
+
+def _undone(motion: Motion) -> str:
+    return f"its motion of {motion.displacement_px:.2f} px undone" if motion.applied else ""
 
 
 def held_out(

@@ -104,6 +104,9 @@ class RigSettings:
         None, "of the camera's files, value ^ (1 / gamma); null: linear", above=0.0, at_most=10.0
     )
     headroom: float = setting(1.25, "saturation level over the brightest full picture", above=0.0)
+    oversample: int = setting(
+        1, "patches along a pixel's side that are rendered and added up; 2 or more where the camera drifts", at_least=1
+    )
     drift_px: float = setting(0.0, "shift of the camera between a light's full picture and its sweep", at_least=0.0)
     drift_deg: float = setting(0.0, "its rotation there", at_least=0.0, at_most=45.0)
     drift_across_px: float = setting(0.0, "shift of the camera between the lights' full pictures", at_least=0.0)
@@ -130,6 +133,13 @@ class FitSettings:
     )
     n_s: float | None = setting(None, "exponent of the lobe; null: fitted", above=0.0, at_most=1000.0)
     refine_n_d: bool = setting(False, "fit n_d as a fifth global")
+    alpha_sd: float = setting(
+        0.0,
+        "uncertainty of stated alphas (directions in radians, relative intensities) within which they are refined by "
+        "the joint fit; 0: held",
+        at_least=0.0,
+        at_most=1.0,
+    )
     weights: Literal["paper", "noise"] = setting("paper", "of Eq. 22: the two lambdas, or each picture's noise")
     lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
     lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)

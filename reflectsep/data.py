@@ -15,7 +15,7 @@ Linear pictures are in the capture's units: scaled to the exposure of the first 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -75,6 +75,13 @@ class Sweep:
     time_s: tuple[float | None, ...] | None = None
     dark: str | None = None
     sha256: tuple[str | None, ...] | None = None
+    bracket: tuple[Sweep, ...] = ()
+    """The same sweep at other exposures, frame by frame; merged as it is read."""
+
+    @property
+    def exposures(self) -> tuple[Sweep, ...]:
+        """Every exposure as a sweep of its own, this one first."""
+        return (replace(self, bracket=()), *self.bracket)
 
     def _repr_html_(self) -> str:
         return _notebook().sweep_html(self)
@@ -249,6 +256,9 @@ class Fit:
     """Picture minus model, in the capture's units."""
     intensity: Float[Tensor, "lights"]
     """Of every light; d, s and B are for lights of unit intensity, a component is intensity times its power."""
+    alpha: Float[Tensor, "lights 3"] | None = None
+    """As the fit refined the stack's; None where it held them."""
+    alpha_sd: Float[Tensor, "lights 3"] | None = None
     flags: Int[Tensor, "height width"]
     noise: float
     """Standard deviation of one residual, in the capture's units."""

@@ -104,7 +104,8 @@ def sweep_html(sweep: Sweep) -> str:
 def sweep_words(sweep: Sweep) -> str:
     """A sweep in a line."""
     lost = f", {len(sweep.lost)} lost" if sweep.lost else ""
-    exposure = "" if sweep.exposure_s is None else f", {sweep.exposure_s:g} s each"
+    times = [f"{one.exposure_s:g}" for one in sweep.exposures if one.exposure_s is not None]
+    exposure = f", {' and '.join(times)} s each" if times else ""
     return f"{sweep.kind} along {sweep.direction}, {sweep.count} frames{lost}{exposure}"
 
 

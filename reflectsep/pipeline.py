@@ -20,10 +20,13 @@ from torch import Tensor
 
 from reflectsep import bench, exporting, presentation, simulation
 from reflectsep import calibration as calibration_job
-from reflectsep.calibrate.alignment import Alignment, AlignOptions, align, aligned_stream
+from reflectsep.calibrate.align_options import AlignOptions
+from reflectsep.calibrate.alignment import Alignment, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
-from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, held_out_pictures, without
-from reflectsep.checking import check_capture, draw, table
+from reflectsep.calibrate.heldout import HeldOutPictures, Still, held_out_pictures, still_of
+from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, without
+from reflectsep.checking.check import check_capture
+from reflectsep.checking.display import draw, table
 from reflectsep.comparison import beside, compare_result, left_out
 from reflectsep.config import (
     CalibrateJob,
@@ -202,14 +205,16 @@ def alignment_of(
     raw = read_full(capture)
     pictures, saturated = develop_pictures(capture, raw, response)
     streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
-    options = AlignOptions(
-        scope="all" if calibration.registration == "all" else "same_light",
-        richest=calibration.motion,
-        n_d=scatter.n_d or 1.0,
-    )
+    options = align_options(calibration, scatter.n_d or 1.0)
     return align(
         capture, raw.names, pictures, saturated, read_mask(capture), streams, options=options, progress=progress
     )
+
+
+def align_options(calibration: CalibrationSettings, n_d: float = 1.0) -> AlignOptions:
+    """Settings of the command as the registration takes them."""
+    scope = "all" if calibration.registration == "all" else "same_light"
+    return AlignOptions(scope=scope, richest=calibration.motion, n_d=n_d)
 
 
 def measure(
@@ -373,12 +378,11 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     folder = recorded_capture(separation, job.result) if job.capture is None else Path(job.capture)
     lights_file = separation.document.get("lights_file")
     capture = load_capture(folder, basis=separation.basis, lights_file=lights_file)
-    heldout = [str(name) for name in separation.document.get("heldout", [])]
     baseline = separation
     if bool(separation.s.any()):  # else it is Lin & Lee's model itself
         baseline = lin_lee_beside(separation, capture, recorded_settings(separation, job.result), progress)
-    pictures = held_out_pictures(capture, heldout) if heldout else None
-    return compare_result(separation, baseline, capture, heldout, pictures, Path(job.out))
+    capture, pictures, still = real_pictures(separation, capture)
+    return compare_result(separation, baseline, capture, pictures, Path(job.out), still=still)
 
 
 def recorded_capture(separation: Separation, result: str) -> Path:
@@ -452,11 +456,20 @@ def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettin
 
 def held_out_rows(separation: Separation, baseline: Separation, capture: Capture) -> list[HeldOut]:
     """Lights with a real picture that the fit never saw."""
-    names = [str(name) for name in separation.document.get("heldout", [])]
     if separation.light_vectors is None:
         return []
-    pictures = held_out_pictures(capture, names) if names else None
-    return left_out(separation, baseline, capture, names, pictures) + beside(separation, baseline, capture)
+    capture, pictures, still = real_pictures(separation, capture)
+    return left_out(separation, baseline, capture, pictures) + beside(separation, baseline, capture, still)
+
+
+def real_pictures(separation: Separation, capture: Capture) -> tuple[Capture, HeldOutPictures | None, Still]:
+    """The capture with the result's calibration, its held-out pictures, and what these are registered against."""
+    calibration = recorded_calibration(separation)
+    options = None if calibration.registration == "none" else align_options(calibration)
+    capture, _ = with_calibration(capture, calibration.file)
+    names = [str(name) for name in separation.document.get("heldout", [])]
+    pictures = held_out_pictures(capture, names, options) if names else None
+    return capture, pictures, still_of(capture, options)
 
 
 def run_export(job: ExportJob, progress: Progress = silent) -> str:

@@ -189,10 +189,14 @@ def separate(
             s_sd = scattering.root_sd[:3].float() * stack.mask
         intensity_root = fit.intensity[:3, None, None, None] ** (1.0 / float(fit.n_d))
         measured = scattering.root[:3].float() / intensity_root
+    alpha, vectors = stack.alpha.float(), None if stack.light_vectors is None else stack.light_vectors.float()
+    if fit.alpha is not None:
+        alpha = fit.alpha
+        vectors = None if vectors is None else torch.cat([vectors[:3], alpha[3:] @ vectors[:3]])
     separation = Separation(
         names=stack.names,
-        alpha=stack.alpha.float(),
-        light_vectors=None if stack.light_vectors is None else stack.light_vectors.float(),
+        alpha=alpha,
+        light_vectors=vectors,
         view=stack.view.float(),
         mask=stack.mask,
         flags=fit.flags,

@@ -31,7 +31,8 @@ def write(job: SimulateJob, progress: Progress) -> str:
         rig: SimulatedRig = paper_rig(job.rig.lights, sigma=job.rig.read_noise, sweeps=job.rig.sweeps)
         simulate_paper(obj, rig, out, seed=job.seed, overwrite=job.overwrite, progress=progress)
     else:
-        made = make_object(job.object.preset, size=job.object.size_px, channels=job.object.channels)
+        size = job.object.size_px * job.rig.oversample
+        made = make_object(job.object.preset, size=size, channels=job.object.channels)
         rig = rig_of(job.rig)
         simulate(made, rig, out, seed=job.seed, overwrite=job.overwrite, progress=progress)
     return f"{out}: {len(rig.lights)} pictures, {len(rig.sweeps)} sweeps, {len(rig.heldout)} held-out lights, the truth"
@@ -51,6 +52,7 @@ def rig_of(settings: RigSettings) -> SimulatedRig:
         full_well_e=full_well,
         bits=settings.bits,
         gamma=settings.gamma,
+        oversample=settings.oversample,
     )
     return make_rig(
         settings.name,

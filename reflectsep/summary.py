@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -53,6 +54,7 @@ def describe(  # noqa: PLR0913  (every stage has its say)
         "covariance": {"order": list(fitted.global_names), "values": fitted.covariance.tolist()},
         "alpha_source": dict(zip(lights.names, lights.source, strict=True)),
         "alpha_agreement": [dataclasses.asdict(a) for a in lights.agreement],
+        **refined_alphas(stack, fitted),
         "noise": fitted.noise,
         "cost": fitted.cost,
         "iterations": fitted.iterations,
@@ -84,6 +86,22 @@ def describe(  # noqa: PLR0913  (every stage has its say)
     return document
 
 
+def refined_alphas(stack: PhotometricStack, fitted: Fit) -> dict[str, Any]:
+    """What the fit made of the stated alphas, light by light; empty where it held them."""
+    if fitted.alpha is None or fitted.alpha_sd is None:
+        return {}
+    basis = stack.light_vectors[:3].double() if stack.light_vectors is not None else None
+    entries: dict[str, Any] = {}
+    for j, name in enumerate(stack.names[3:], start=3):
+        stated, refined = stack.alpha[j].double(), fitted.alpha[j].double()
+        entries[name] = {"stated": stated.tolist(), "refined": refined.tolist(), "sd": fitted.alpha_sd[j].tolist()}
+        if basis is not None:
+            a, b = stated @ basis, refined @ basis
+            angle = math.degrees(math.atan2(float(torch.linalg.cross(a, b).norm()), float(a @ b)))
+            entries[name] |= {"turned_deg": angle, "intensity_percent": 100.0 * (float(b.norm() / a.norm()) - 1.0)}
+    return {"alpha_refined": entries}
+
+
 def capture_summary(capture: Capture) -> str:
     """A capture in a few lines; no picture is read."""
     lines = [f"capture of {capture.object} in {capture.folder}"]
@@ -95,7 +113,10 @@ def capture_summary(capture: Capture) -> str:
     lines.append(f"  encoding  {capture.encoding.kind}")
     for sweep in capture.sweeps:
         lost = f", {len(sweep.lost)} lost" if sweep.lost else ""
-        lines.append(f"  sweep     {sweep.light} along {sweep.direction}: {sweep.count} frames{lost}, {sweep.kind}")
+        several = f" at {len(sweep.exposures)} exposures" if sweep.bracket else ""
+        lines.append(
+            f"  sweep     {sweep.light} along {sweep.direction}: {sweep.count} frames{several}{lost}, {sweep.kind}"
+        )
     if not capture.sweeps:
         lines.append("  sweeps    none: a fit of it is the model of Lin & Lee")
     return "\n".join(lines)
@@ -116,6 +137,12 @@ def summary(separation: Separation, *, full: bool = False) -> str:
         lines.append(f"  size      {width} x {height}, {int(separation.mask.sum())} pixels on the object")
         kept = extensions(float(separation.softness), float(separation.haze))
         lines += [f"  beyond    {kept}"] if kept else []
+        for name, entry in document.get("alpha_refined", {}).items():
+            said = ", ".join(
+                f"{value:.4f} +- {sd:.2g}" for value, sd in zip(entry["refined"], entry["sd"], strict=True)
+            )
+            how = f"; turned by {entry['turned_deg']:.2f} deg, {entry['intensity_percent']:+.2f} % in intensity"
+            lines.append(f"  alpha     {name}: {said}{how if 'turned_deg' in entry else ''}")
         for sweep in document.get("sweeps", []):
             gain = f"C {sweep['gain']:.4f} +- {sweep['gain_sd']:.2g}"
             lines.append(f"  sweep     {sweep['light']} along {sweep['direction']}: {gain}")

@@ -6,7 +6,10 @@ import dataclasses
 
 import torch
 
-from reflectsep.comparison import without_a_lobe
+from reflectsep.calibrate.heldout import HeldOutPictures
+from reflectsep.calibrate.motion import Motion
+from reflectsep.comparison import left_out, without_a_lobe
+from reflectsep.data import Light
 
 
 def with_pictures(separation, pictures):
@@ -47,3 +50,27 @@ def test_nothing_is_fitted_to_unknown_lights_nor_a_polynomial_to_too_few(result)
     few = result(size=8)
     few = dataclasses.replace(few, alpha=few.alpha[:5], light_vectors=few.light_vectors[:5], residual=few.residual[:5])
     assert set(without_a_lobe(few, alpha)) == {"Lambert"}
+
+
+def test_a_held_out_picture_says_that_it_was_moved_and_leaves_out_what_is_clipped(result):
+    separation = result(size=8, channels=1)
+
+    @dataclasses.dataclass
+    class Lights:
+        lights: dict
+
+    capture = Lights({"A": Light(name="A", direction=(0.0, 0.0, 1.0)), "B": Light(name="B", direction=(0.0, 0.6, 0.8))})
+    clipped = torch.zeros(2, 1, 8, 8, dtype=torch.bool)
+    clipped[1, 0, 2, 3] = True
+    pictures = HeldOutPictures(
+        names=("A", "B"),
+        values=torch.full((2, 1, 8, 8), 0.5),
+        clipped=clipped,
+        motions=(Motion(displacement_px=1.5, applied=True), Motion(displacement_px=0.02)),
+    )
+    moved, still = left_out(separation, separation, capture, pictures)
+    assert moved.note == "its motion of 1.50 px undone"
+    assert still.note == ""
+    assert int((~still.counts).sum()) == 1
+    assert float(still.real[0, 2, 3]) == 0.0
+    assert left_out(separation, separation, capture, None) == []

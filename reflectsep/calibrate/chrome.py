@@ -73,7 +73,7 @@ def find_circle(mask: Bool[Tensor, "height width"]) -> Circle:
     near = distance[best] < TOUCHING
     centre, radius, error = centres[best], radii[best], distance[best]
     for _ in range(5):
-        centre, radius = _least_squares(points[near])
+        centre, radius = least_squares_circle(points[near])
         error = (points - centre).norm(dim=1) - radius
         near = error.abs() < TOUCHING
         if int(near.sum()) < FEWEST_RIM // 2:
@@ -89,22 +89,6 @@ def find_circle(mask: Bool[Tensor, "height width"]) -> Circle:
         residual_px=float(error[near].square().mean().sqrt()),
         support=support,
     )
-
-
-def find_ball(pictures: Float[Tensor, "lights height width"]) -> Bool[Tensor, "height width"]:
-    """A mask of the ball where none is given: what is brighter than the background in the mean of all pictures.
-
-    The threshold parts the mean picture's values in two classes (Otsu); the largest connected region's filled
-    outline is the ball. It needs a dark background.
-
-    Raises:
-        LightError: nothing stands out.
-    """
-    mean = torch.log1p(pictures.clamp_min(0).mean(0) / pictures.clamp_min(0).mean().clamp_min(1e-12))
-    mask = _largest(mean > _otsu(mean))
-    if int(mask.sum()) < FEWEST_RIM * 4:
-        raise LightError("chrome ball: nothing stands out of the background; give a mask or circle=[x,y,radius]")
-    return mask
 
 
 def disc(circle: Circle, height: int, width: int) -> Bool[Tensor, "height width"]:
@@ -277,8 +261,8 @@ def _through(triples: Tensor) -> tuple[Tensor, Tensor]:
     return centre, torch.where(determinant.abs() > 1e-6, radius, torch.nan)
 
 
-def _least_squares(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Algebraic circle fit, then two geometric steps."""
+def least_squares_circle(points: Float[Tensor, "points 2"]) -> tuple[Float[Tensor, "2"], Float[Tensor, ""]]:
+    """Centre and radius through points (column, row): algebraic, then three geometric steps."""
     columns = torch.cat([2 * points, torch.ones(len(points), 1, dtype=points.dtype)], 1)
     solution = torch.linalg.lstsq(columns, points.square().sum(1, keepdim=True)).solution[:, 0]
     centre = solution[:2]
@@ -290,17 +274,6 @@ def _least_squares(points: Tensor) -> tuple[Tensor, Tensor]:
         step = torch.linalg.lstsq(jacobian, -(length - radius)[:, None]).solution[:, 0]
         centre = centre + step[:2]
     return centre, (points - centre).norm(dim=1).mean()
-
-
-def _otsu(values: Tensor) -> float:
-    counts = torch.histc(values.float(), 256)
-    low, high = float(values.min()), float(values.max())
-    levels = torch.linspace(low, high, 256, dtype=torch.float64)
-    share = counts.double() / counts.sum()
-    below = share.cumsum(0)
-    mean = (share * levels).cumsum(0)
-    between = (mean[-1] * below - mean).square() / (below * (1 - below)).clamp_min(1e-12)
-    return float(levels[int(between.argmax())])
 
 
 def _largest(mask: Tensor) -> Tensor:

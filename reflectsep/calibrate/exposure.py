@@ -8,6 +8,7 @@ sweep's dark pixels would grow with the number of its frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -15,11 +16,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reflectsep.calibrate.bracket import NEARLY
+from reflectsep.calibrate.bracketed_sweep import BracketedStream
 from reflectsep.calibrate.develop import Response, develop, gamma_response, linear_response, table_response
 from reflectsep.calibrate.flat import flat_of
 from reflectsep.data import Capture, Frame, FrameStream, Light, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io.files import inside
+from reflectsep.io.frames import open_sweep
 from reflectsep.io.manifest import frame_file
 from reflectsep.io.response import read_response
 from reflectsep.io.stack import read_sweep_dark
@@ -83,6 +87,8 @@ class DevelopedStream:
     """Names the capture in errors."""
     flat: Float[Tensor, "channels height width"] | None = None
     """Uneven light over the field, divided out."""
+    limit: float = math.inf
+    """Stored values above it count as clipped in a frame that clips anywhere."""
 
     @property
     def sweep(self) -> Sweep:
@@ -110,7 +116,10 @@ class DevelopedStream:
             bad = int((~torch.isfinite(values)).sum())
             if bad:
                 raise CaptureError(f"{name}: {bad} values are not finite numbers; expected none")
-            yield replace(frame, values=values)
+            saturated = frame.saturated
+            if saturated is not None and math.isfinite(self.limit) and bool(saturated.any()):
+                saturated = saturated | (frame.values > self.limit)
+            yield replace(frame, values=values, saturated=saturated)
 
     def _name(self, index: int) -> str:
         return frame_file(self.sweep, index) if self.sweep.video is None else f"{self.sweep.video}, frame {index}"
@@ -119,11 +128,11 @@ class DevelopedStream:
 def developed_stream(capture: Capture, stream: FrameStream, response: Response | None = None) -> FrameStream:
     """`stream` in the capture's units: with the sweep's own dark picture, exposure and light colour.
 
-    Lazy and as re-iterable as `stream`: one frame is in memory at a time.
+    Lazy and as re-iterable as `stream`: one frame is in memory at a time, of a sweep at several exposures one of each.
 
     Args:
         capture: whose sweep it is.
-        stream: of stored frames.
+        stream: of stored frames; the other exposures of a bracket are opened here.
         response: the capture's, where it was read before.
 
     Raises:
@@ -131,6 +140,15 @@ def developed_stream(capture: Capture, stream: FrameStream, response: Response |
             finite.
     """
     response = response or response_of(capture)
+    if stream.sweep.bracket:
+        each = [stream, *(open_sweep(capture, sweep) for sweep in stream.sweep.bracket)]
+        developed = tuple(replace(_developed(capture, one, response), limit=NEARLY) for one in each)
+        return BracketedStream(streams=developed, where=str(capture.folder))
+    return _developed(capture, stream, response)
+
+
+def _developed(capture: Capture, stream: FrameStream, response: Response) -> DevelopedStream:
+    """One exposure."""
     return DevelopedStream(
         stream=stream,
         response=response,
@@ -155,6 +173,6 @@ def missing_darks(capture: Capture) -> tuple[str, ...]:
     return tuple(
         f"sweep of {sweep.light} along {sweep.direction}: no dark picture of its exposure"
         + (f" ({sweep.exposure_s:g} s)" if sweep.exposure_s is not None else "")
-        for sweep in capture.sweeps
+        for sweep in (one for sweep in capture.sweeps for one in sweep.exposures)
         if read_sweep_dark(capture, sweep) is None
     )

@@ -128,40 +128,13 @@ def _still(raw: RawPictures, images: Tensor, alignment: Alignment) -> tuple[Tens
     return torch.stack(still), torch.stack(clipped), covered(alignment, *images.shape[-2:])
 
 
-def held_out_pictures(
-    capture: Capture, names: Sequence[str]
-) -> tuple[
-    Float[Tensor, "lights channels height width"],
-    Bool[Tensor, "lights channels height width"],
-]:
-    """Pictures of lights that a fit left out, developed as its stack was, and which of their values are clipped.
-
-    Values that are not finite are 0 and count as clipped, so that whoever leaves clipped values out leaves them out.
-
-    Raises:
-        LightError: a name without a full picture, or no name.
-        CaptureError: as `calibrate_stack`.
-    """
-    _check_names(capture, names)
-    if not names:
-        raise LightError(f"{capture.folder}: no held-out lights named; expected at least one")
-    wanted = {*names, capture.basis[0]}  # the first basis picture says which size and channels are expected
-    images = tuple(picture for picture in capture.images if picture.kind != "full" or picture.light in wanted)
-    first = capture.basis[0]
-    raw = read_full(replace(capture, images=images, basis=(first, first, first)))
-    pictures, saturated = develop_pictures(capture, raw, response_of(capture))
-    finite = torch.isfinite(pictures)
-    order = [raw.names.index(name) for name in names]
-    return torch.where(finite, pictures, 0.0)[order], (saturated | ~finite)[order]
-
-
 def without(capture: Capture, drop: Sequence[str]) -> Capture:
     """`capture` without the full pictures of the lights in `drop`.
 
     Raises:
         LightError: a light that has no full picture, or that is of the basis.
     """
-    _check_names(capture, drop)
+    check_names(capture, drop)
     basis = [name for name in drop if name in capture.basis]
     if basis:
         raise LightError(f"{capture.folder}: light {basis[0]} is of the basis and cannot be left out; choose another")
@@ -215,8 +188,12 @@ def _merged(capture: Capture, name: str, like: Tensor, response: Response) -> tu
     return merge(pictures, bad, [exposure_s for exposure_s, _, _ in shots])
 
 
-def _check_names(capture: Capture, names: Sequence[str]) -> None:
-    """Refuse names that have no full picture."""
+def check_names(capture: Capture, names: Sequence[str]) -> None:
+    """Refuse names that have no full picture.
+
+    Raises:
+        LightError: one of them, with the nearest name that there is.
+    """
     for name in names:
         if name not in capture.names:
             known = ", ".join(capture.names)

@@ -17,24 +17,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reflectsep.fit.mixing import by_beta
 from reflectsep.fit.problem import (
+    ALPHA,
     LOG_C_2,
     LOG_N_D,
     LOG_N_S,
     ROOT_HAZE,
-    SHARED_NAMES,
     SOFTNESS,
     Locals,
     Observations,
     Priors,
     across,
+    mixing_of,
     normalised_lobe,
     pixel_residual,
+    refined,
     s_of_lights,
     unpack,
     unpack_globals,
 )
-from reflectsep.model import HAZE_RATIO, Globals, edge_width, lobe_argument
+from reflectsep.model import HAZE_RATIO, Globals, diffuse, edge_width, lobe, lobe_argument
 
 
 @dataclass(frozen=True)
@@ -101,10 +104,11 @@ def jacobians(
 ) -> tuple[
     Float[Tensor, "pixels residuals"],
     Float[Tensor, "pixels residuals P"],
-    Float[Tensor, "pixels residuals 8"] | None,
+    Float[Tensor, "pixels residuals G"] | None,
 ]:
     """`pixel_residual` and its derivatives by a pixel's own unknowns and by the shared ones (None unless asked for)."""
     r = pixel_residual(local, shared, obs, priors)
+    stated, obs = obs, refined(obs, shared)
     x = unpack(local, obs.channels)
     g = unpack_globals(shared, obs.n_d)
     pixels, channels, lights = obs.images.shape
@@ -121,7 +125,7 @@ def jacobians(
     fill_priors(expectations, x, shared, obs, priors)
     if not with_shared:
         return r, J, None
-    K = r.new_zeros(pixels, r.shape[1], len(SHARED_NAMES))
+    K = r.new_zeros(pixels, r.shape[1], len(shared))
     pictures = K[:, : channels * lights].view(pixels, channels, lights, -1)
     pictures[..., :3] = (pull * shine.by_u[:, None])[..., None] * obs.alpha
     pictures[..., LOG_N_S] = pull * shine.by_log_n_s[:, None]
@@ -129,6 +133,8 @@ def jacobians(
     pictures[..., SOFTNESS] = pull * body.by_width * edge_width(obs.s_basis, shared.new_ones(()))
     if obs.n_d is None:
         pictures[..., LOG_N_D] = pull * body.by_log_n_d
+    if len(shared) > ALPHA:
+        alpha_columns(pictures, x, shared, stated, obs, (pull, root, body, shine))
     first = channels * lights
     K[:, first, LOG_C_2] = -priors.shape
     lobe = first + 2 + 3 * channels
@@ -136,6 +142,37 @@ def jacobians(
     K[:, lobe : lobe + 3, LOG_C_2] = -priors.lobe_weight[:, None] * v
     K[:, lobe + 3 : lobe + 6, LOG_C_2] = -priors.facing_weight[:, None] * across(v, priors.facing)
     return r, J, K
+
+
+def alpha_columns(
+    pictures: Float[Tensor, "pixels channels lights G"],
+    x: Locals,
+    shared: Tensor,
+    stated: Observations,
+    obs: Observations,
+    known: tuple[Tensor, Tensor, BodySlopes, LobeSlopes],
+) -> None:
+    """Fill in the derivatives of the weighted pictures by what is added to the stated alphas.
+
+        dI_cj / dalpha_ji = P'_cj (d_ci + s_ci) + F'_j (a_i + B mean_c d_ci)
+
+    s_ci is only what the fit changed of it where light j has a sweep of its own. `obs` are those of the refined
+    alphas, `known` their weights, roots and slopes.
+    """
+    pull, root, body, shine = known
+    g = unpack_globals(shared, obs.n_d)
+    own = torch.tensor(obs.swept or [False] * len(obs.alpha))[3:, None]
+    s = obs.s_basis if x.s is None else x.s
+    mixed_root = (x.d + s)[:, :, None] - torch.where(own, obs.s_basis[:, :, None], 0.0)
+    lobe_root = g.a + x.B[:, None] * x.d.mean(1)
+    by_alpha = body.by_root[..., 3:, None] * mixed_root + (shine.by_u[:, 3:, None] * lobe_root[:, None])[:, None]
+    u = lobe_root @ obs.alpha.mT
+    model = diffuse(root, edge_width(obs.s_basis, shared[SOFTNESS]), g.n_d) + lobe(u, g.n_s, g.haze)[:, None]
+    mixed = mixing_of(stated, shared)
+    slopes = (pull / mixed.intensity)[..., 3:, None] * by_beta(mixed, model, by_alpha)
+    for j in range(slopes.shape[2]):
+        at = ALPHA + 3 * j
+        pictures[:, :, 3 + j, at : at + 3] = slopes[:, :, j]
 
 
 def fill_pictures(

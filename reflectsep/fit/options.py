@@ -20,6 +20,10 @@ class FitOptions:
     """Fixed exponent of the lobe; None: fitted."""
     refine_n_d: bool = False
     """Fit n_d as a fifth global, from where the sweeps put it."""
+    alpha_sd: float = 0.0
+    """Standard deviation of the stated alphas of the lights beside the basis (of lights of unit intensity, so about
+    that of their directions, in radians, and relative intensities), within which the joint fit refines them, three
+    more globals a light. 0 holds them."""
     weights: Literal["paper", "noise"] = "paper"
     """lambda of Eq. 22, or one weight for all pictures."""
     lambda_basis: float = 1.0

@@ -10,8 +10,11 @@ from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
+    ALPHA,
     SHARED_NAMES,
+    mixing_of,
     pixel_residual,
+    refined,
     s_of_lights,
     unpack,
     unpack_globals,
@@ -46,21 +49,24 @@ def describe(
     misfit = picture_residual(state)
     B, B_sd = x.B, x.B * sd.log_B
     picture = lambda values: to_picture(values, mask)  # noqa: E731
+    alpha, alpha_sd, strength = refined_alpha(state, intensity, covariance)
     return Fit(
         a=g.a.float(),
         n_s=g.n_s.float(),
         n_d=torch.as_tensor(g.n_d).float(),
         softness=g.softness.abs().float(),
         haze=g.haze.float(),
-        global_names=tuple(n for n, free in zip(SHARED_NAMES, state.free.tolist(), strict=True) if free),
+        global_names=tuple(n for n, free in zip(names_of(stack, state), state.free.tolist(), strict=True) if free),
         covariance=covariance[state.free][:, state.free],
         d=picture(x.d),
-        s=picture(s_of_lights(x, obs)),
+        s=picture(s_of_lights(x, refined(obs, shared))),
         B=picture(B[:, None, None].expand(-1, obs.channels, 1))[0],
         d_sd=picture(sd.d),
         B_sd=picture(B_sd[:, None, None].expand(-1, obs.channels, 1))[0],
         residual=picture(-misfit * intensity),
-        intensity=intensity.float(),
+        intensity=strength.float(),
+        alpha=alpha,
+        alpha_sd=alpha_sd,
         flags=final_flags(state, stack, scattering, misfit),
         noise=state.sigma,
         cost=float(state.found.cost.sum()),
@@ -68,6 +74,26 @@ def describe(
         history=tuple({"cost": c} for c in (state.joint.history if state.joint is not None else ())),
         warnings=warnings(state, options),
     )
+
+
+def names_of(stack: PhotometricStack, state: State) -> tuple[str, ...]:
+    """Names of the globals; a refined alpha is named after its light and its basis light."""
+    others = [f"alpha_{name}_{basis}" for name in stack.names[3:] for basis in stack.names[:3]]
+    return (*SHARED_NAMES, *others) if len(state.shared) > ALPHA else SHARED_NAMES
+
+
+def refined_alpha(
+    state: State, intensity: Float[Tensor, "lights"], covariance: Float[Tensor, "G G"]
+) -> tuple[Float[Tensor, "lights 3"] | None, Float[Tensor, "lights 3"] | None, Float[Tensor, "lights"]]:
+    """Alphas in the capture's units and their standard deviation, None where they were held; and all intensities."""
+    if len(state.shared) == ALPHA:
+        return None, None, intensity
+    mixed = mixing_of(state.obs, state.shared)
+    strength = intensity * mixed.intensity
+    alpha = mixed.alpha * strength[:, None] / intensity[:3]
+    sd = torch.zeros_like(alpha)
+    sd[3:] = covariance.diagonal()[ALPHA:].clamp_min(0.0).sqrt().view(-1, 3)
+    return alpha.float(), (sd * intensity[:, None] / intensity[:3]).float(), strength
 
 
 def to_picture(values: Float[Tensor, "pixels channels maps"], mask: Tensor) -> Float[Tensor, "maps channels h w"]:
@@ -84,7 +110,7 @@ def picture_residual(state: State) -> Float[Tensor, "pixels channels lights"]:
     return rows[:, :count].view_as(state.obs.images) / state.obs.weight
 
 
-def shared_covariance(state: State) -> Float[Tensor, "8 8"]:
+def shared_covariance(state: State) -> Float[Tensor, "G G"]:
     """Inverse of the reduced system over the free globals, zero elsewhere."""
     problem = build_problem(state.obs, state.priors, robust=state.robust)
     S = reduced_system(problem, state.found.local, state.shared, state.effort.chunk).S
@@ -94,7 +120,7 @@ def shared_covariance(state: State) -> Float[Tensor, "8 8"]:
     return covariance
 
 
-def local_deviation(state: State, covariance: Float[Tensor, "8 8"]) -> Float[Tensor, "pixels P"]:
+def local_deviation(state: State, covariance: Float[Tensor, "G G"]) -> Float[Tensor, "pixels P"]:
     """Standard deviation of every local unknown, that of the globals carried along.
 
     cov(l) = V^-1 + V^-1 W cov(g) W^T V^-1

@@ -1,7 +1,7 @@
 """Eqs. 20 to 22 as a least-squares problem of blocks: one block a pixel.
 
     local   l = (d_11, d_12, d_13, d_21, ...; log B [; s_11, ...])       channel-major; 3 C + 1 [+ 3 C] numbers
-    shared  g = (a_1, a_2, a_3, log n_s, log C_2, softness, sqrt haze, log n_d)
+    shared  g = (a_1, a_2, a_3, log n_s, log C_2, softness, sqrt haze, log n_d [; delta_41, delta_42, ...])
 
 Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel and light, then the priors' rows:
 
@@ -21,10 +21,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from reflectsep.fit.mixing import Mixing, mixing
 from reflectsep.model import Globals, edge_width, reflectance
 
 SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haze", "log_n_d")
 LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
+ALPHA = len(SHARED_NAMES)
+"""Where what is added to the stated alphas begins, if they are refined."""
 
 LEAST_LOG_N_S = 1.4
 """log of 4: a broader lobe is no highlight but diffuse light that the diffuse part has not explained."""
@@ -121,6 +124,8 @@ class Priors:
     softness_sd: float = 0.3
     haze_sd: float = 0.3
     """Standard deviation of sqrt(haze)."""
+    alpha_sd: float = 0.02
+    """Standard deviation of a stated alpha, of lights of unit intensity."""
 
     def take(self, index: Tensor) -> Priors:
         """Some of the pixels."""
@@ -181,7 +186,31 @@ def unpack(local: Tensor, channels: int) -> Locals:
     return Locals(d, local[..., P], s)
 
 
-def unpack_globals(shared: Float[Tensor, "8"], n_d: float | None) -> Globals:
+def mixing_of(obs: Observations, shared: Float[Tensor, "G"]) -> Mixing:
+    """Alphas as `shared` has them."""
+    return mixing(obs.alpha, shared[ALPHA:], torch.linalg.inv(obs.normal_map) if obs.lights_known else None)
+
+
+def refined(obs: Observations, shared: Float[Tensor, "G"]) -> Observations:
+    """`obs` as the refined alphas see them: pictures, weights and mixed scattering of lights of unit intensity.
+
+    The same where alphas are held, and then `obs` itself.
+    """
+    if len(shared) == ALPHA:
+        return obs
+    mixed = mixing_of(obs, shared)
+    own = torch.tensor(obs.swept or [False] * len(obs.alpha))
+    moved = obs.s_basis @ (mixed.alpha - obs.alpha).mT
+    return replace(
+        obs,
+        alpha=mixed.alpha,
+        images=obs.images / mixed.intensity,
+        weight=obs.weight * mixed.intensity,
+        s=obs.s + torch.where(own, 0.0, moved),
+    )
+
+
+def unpack_globals(shared: Float[Tensor, "G"], n_d: float | None) -> Globals:
     """The shared unknowns by name, in the model's own parameters; `n_d` where it is not fitted."""
     return Globals(
         a=shared[:3],
@@ -231,6 +260,7 @@ def pixel_residual(
     local: Tensor, shared: Tensor, obs: Observations, priors: Priors
 ) -> Float[Tensor, "pixels residuals"]:
     """Residuals of every pixel, pictures first, then the priors' rows."""
+    obs = refined(obs, shared)
     x = unpack(local, obs.channels)
     s = obs.s_basis if x.s is None else x.s
     model = reflectance(
@@ -276,5 +306,6 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             (shared[LOG_N_D] - priors.log_n_d) / priors.n_d_sd,
             shared[SOFTNESS] / priors.softness_sd,
             shared[ROOT_HAZE] / priors.haze_sd,
+            *(shared[ALPHA:] / priors.alpha_sd),
         ]
     )

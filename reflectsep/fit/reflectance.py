@@ -29,6 +29,7 @@ from reflectsep.fit.expectations import (
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.outcome import describe, picture_residual
 from reflectsep.fit.problem import (
+    ALPHA,
     LOG_C_2,
     ROOT_HAZE,
     SOFTNESS,
@@ -81,8 +82,11 @@ def fit_reflectance(
         progress: called as (stage, done, total).
 
     Raises:
-        FitError: too few pictures, no usable pixel, or pictures without contrast.
+        FitError: too few pictures, no usable pixel, pictures without contrast, or alphas to be refined without a joint
+            fit.
     """
+    if options.alpha_sd > 0 and options.method != "joint":
+        raise FitError(f"alpha_sd {options.alpha_sd:g} with method {options.method}: alphas are refined jointly alone")
     dtype = torch.float64 if options.dtype == "float64" else torch.float32
     obs, mask, intensity = observe(stack, scattering, options, dtype)
     state = prepare(obs, mask, options)
@@ -171,6 +175,11 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
         priors = replace(priors, ratio_weight=torch.zeros_like(priors.ratio_weight))
     shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)
     free = torch.tensor([True, True, True, options.n_s is None, True, False, False, options.refine_n_d])
+    if options.alpha_sd > 0:
+        priors = replace(priors, alpha_sd=options.alpha_sd)
+        others = 3 * (len(obs.alpha) - 3)
+        shared = torch.cat([shared, shared.new_zeros(others)])
+        free = torch.cat([free, torch.zeros(others, dtype=torch.bool)])
     polish = Termination(tolerance=options.tolerance * 1e-2, max_iterations=60)
     chunk = -(-options.chunk // obs.channels)
     joint = JointOptions(max_iterations=options.max_iterations, tolerance=options.tolerance, chunk=chunk)
@@ -263,6 +272,11 @@ def with_noise(state: State, options: FitOptions, sigma: float) -> State:
 
 def refine(state: State, options: FitOptions, progress: Progress) -> State:
     """Everything jointly; then haze and soft shadows where they pay; then the neighbourhood's say."""
+    if options.alpha_sd > 0:
+        # Only now: a handful of pixels would lead alphas astray before the lobe is known.
+        free = state.free.clone()
+        free[ALPHA:] = True
+        state = replace(state, free=free)
     state = joint_step(state, "joint fit", progress)
     if options.lobe != "single":
         state = try_extensions(state, options, progress)

@@ -21,6 +21,7 @@ from reflectsep.fit.problem import (
     Observations,
     Priors,
     log_shape,
+    refined,
     shape_row,
     unpack_globals,
 )
@@ -105,7 +106,7 @@ class Candidates:
 def scan(
     obs: Observations,
     priors: Priors,
-    shared: Float[Tensor, "8"],
+    shared: Float[Tensor, "G"],
     *,
     keep: int,
     values: int = 32,
@@ -113,6 +114,7 @@ def scan(
     robust: float = 20.0,
 ) -> Candidates:
     """Local minima of the cost over B of every pixel; B geometric about what the shape prior expects."""
+    obs = refined(obs, shared)
     mean = grey(obs)
     globals_ = unpack_globals(shared, obs.n_d)
     target, s = mean.images[:, 0], mean.s[:, 0]
@@ -169,12 +171,12 @@ def informative_pixels(
 def globals_grid(
     obs: Observations,
     priors: Priors,
-    start: Float[Tensor, "8"],
+    start: Float[Tensor, "G"],
     exponents: Sequence[float] = GRID_N_S,
     *,
     trim: float,
     best: int,
-) -> list[Float[Tensor, "8"]]:
+) -> list[Float[Tensor, "G"]]:
     """The best starts of the globals: mirror lobes a_k = C_1 L_k.V, C_2 = -2 C_1 over a grid of (n_s, height).
 
     Scored by the cheapest `trim` share of the pixels, so that those in wrong minima have no vote.

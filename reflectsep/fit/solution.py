@@ -19,6 +19,7 @@ from reflectsep.fit.problem import (
     Locals,
     Observations,
     Priors,
+    refined,
     unpack,
     unpack_globals,
 )
@@ -69,7 +70,7 @@ class LocalFit:
 
 
 def fit_locals(
-    obs: Observations, priors: Priors, shared: Float[Tensor, "8"], effort: Effort, robust: float | None
+    obs: Observations, priors: Priors, shared: Float[Tensor, "G"], effort: Effort, robust: float | None
 ) -> LocalFit:
     """Search over B, then LM from the best minima of every pixel, the globals held (the paper's second step)."""
 
@@ -127,12 +128,12 @@ def merge(
 def fit_globals(
     obs: Observations,
     priors: Priors,
-    starts: Sequence[Float[Tensor, "8"]],
-    free: Bool[Tensor, "8"],
+    starts: Sequence[Float[Tensor, "G"]],
+    free: Bool[Tensor, "G"],
     effort: Effort,
     robust: float | None,
     report: Report,
-) -> Float[Tensor, "8"]:
+) -> Float[Tensor, "G"]:
     """The globals from chosen pixels (the paper's first step): from each start, search and joint fit in turn.
 
     Only the `trim` share of the pixels that the model explains best takes part in a joint fit: one pixel in a wrong
@@ -160,7 +161,7 @@ def fit_globals(
     return min(results, key=lambda entry: entry[:2])[2]
 
 
-def met(shared: Float[Tensor, "8"], passed: Sequence[Float[Tensor, "8"]]) -> bool:
+def met(shared: Float[Tensor, "G"], passed: Sequence[Float[Tensor, "G"]]) -> bool:
     """Whether an earlier start came by here, and so leads where this one would."""
     return any(float((shared - place).abs().max()) < SAME_WAY for place in passed)
 
@@ -169,8 +170,8 @@ def fit_everything(
     obs: Observations,
     priors: Priors,
     found: LocalFit,
-    shared: Float[Tensor, "8"],
-    free: Bool[Tensor, "8"],
+    shared: Float[Tensor, "G"],
+    free: Bool[Tensor, "G"],
     effort: Effort,
     robust: float | None,
     report: Report,
@@ -199,7 +200,7 @@ def hand_on_lobes(
     obs: Observations,
     priors: Priors,
     found: LocalFit,
-    shared: Float[Tensor, "8"],
+    shared: Float[Tensor, "G"],
     mask: Bool[Tensor, "height width"],
     effort: Effort,
     robust: float | None,
@@ -219,7 +220,7 @@ def offer_lobes(
     obs: Observations,
     priors: Priors,
     found: LocalFit,
-    shared: Float[Tensor, "8"],
+    shared: Float[Tensor, "G"],
     lobe_vector: Float[Tensor, "pixels 3"],
     effort: Effort,
     robust: float | None,
@@ -247,9 +248,10 @@ def offer_lobes(
 
 
 def worth_trying(
-    obs: Observations, local: Tensor, shared: Float[Tensor, "8"], lobe_vector: Float[Tensor, "pixels 3"]
+    obs: Observations, local: Tensor, shared: Float[Tensor, "G"], lobe_vector: Float[Tensor, "pixels 3"]
 ) -> Int[Tensor, "some"]:
     """Pixels that another lobe could lead elsewhere: not where it is the present one, nor where neither is seen."""
+    obs = refined(obs, shared)
     x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
     own = x.B[:, None] * x.d.mean(1)
     same = (lobe_vector - own).norm(dim=-1) <= SAME_LOBE * own.norm(dim=-1)
@@ -270,4 +272,4 @@ def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) 
 def lobe_pictures(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels lights"]:
     """Off-specular value of every pixel and light."""
     x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
-    return lobe(lobe_argument(x.d, x.B, g.a, obs.alpha), g.n_s, g.haze)
+    return lobe(lobe_argument(x.d, x.B, g.a, refined(obs, shared).alpha), g.n_s, g.haze)

@@ -22,8 +22,8 @@ class State:
     effort: Effort
     robust: float | None
     sigma: float
-    shared: Float[Tensor, "8"]
-    free: Bool[Tensor, "8"]
+    shared: Float[Tensor, "G"]
+    free: Bool[Tensor, "G"]
     body: Float[Tensor, "pixels channels 3"]
     """Robust whole diffuse root, from before any lobe was fitted."""
     found: LocalFit

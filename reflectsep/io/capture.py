@@ -58,7 +58,7 @@ def files(capture: Capture) -> Iterator[tuple[str, str, str | None]]:
     """
     for index, picture in enumerate(capture.images):
         yield picture.file, f"images[{index}]", picture.sha256
-    for index, sweep in enumerate(capture.sweeps):
+    for index, sweep in enumerate(one for listed in capture.sweeps for one in listed.exposures):
         place = f"sweeps[{index}]"
         if sweep.video is not None:
             yield sweep.video, place, sweep.sha256[0] if sweep.sha256 else None
@@ -113,9 +113,9 @@ def write_manifest(folder: Path | str, capture: Capture) -> Capture:
     folder = Path(folder)
     capture = replace(capture, folder=folder, checksums={})
     images = tuple(replace(picture, sha256=_sum(folder, picture.file)) for picture in capture.images)
-    sweeps = tuple(replace(sweep, sha256=_sweep_sums(folder, sweep)) for sweep in capture.sweeps)
+    sweeps = tuple(_with_sums(folder, sweep) for sweep in capture.sweeps)
     own = {picture.file for picture in images}
-    rest = [capture.mask, capture.encoding.response, *(sweep.dark for sweep in sweeps)]
+    rest = [capture.mask, capture.encoding.response, *(one.dark for sweep in sweeps for one in sweep.exposures)]
     capture = replace(
         capture,
         images=images,
@@ -133,6 +133,11 @@ def _sum(folder: Path, file: str) -> str:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file, so no manifest can name it")
     return sha256(path)
+
+
+def _with_sums(folder: Path, sweep: Sweep) -> Sweep:
+    first, *others = (replace(one, sha256=_sweep_sums(folder, one)) for one in sweep.exposures)
+    return replace(first, bracket=tuple(others))
 
 
 def _sweep_sums(folder: Path, sweep: Sweep) -> tuple[str | None, ...]:

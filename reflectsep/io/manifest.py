@@ -6,6 +6,7 @@ Every check that needs the document alone is here; whether the files exist is as
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,6 +32,8 @@ KEYS = {
 }
 """Keys that an object of each kind may have."""
 
+SAME_PLACE = 0.05
+"""Of a step, within which the frames of two exposures show the slab at the same place."""
 PER_FRAME = ("position_mm", "time_s", "sha256")
 
 T = TypeVar("T")
@@ -55,7 +58,7 @@ def parse(document: Any, path: Path) -> Capture:
     root.object(KEYS["capture"], ("format", "lights", "basis", "images"))
     lights = _lights(root.child("lights"))
     images = tuple(_picture(node, lights) for node in root.child("images").items())
-    sweeps = root.optional("sweeps", lambda node: tuple(_sweep(item, lights) for item in node.items()), ())
+    sweeps = root.optional("sweeps", lambda node: _bracketed([_sweep(item, lights) for item in node.items()]), ())
     return Capture(
         folder=path.parent,
         object=root.optional("object", read.text, "object"),
@@ -89,7 +92,7 @@ def serialise(capture: Capture) -> dict[str, Any]:
     document["images"] = [
         _without_none({key: getattr(picture, key) for key in KEYS["image"]}) for picture in capture.images
     ]
-    document["sweeps"] = [_sweep_document(capture, sweep) for sweep in capture.sweeps]
+    document["sweeps"] = [_sweep_document(capture, one) for sweep in capture.sweeps for one in sweep.exposures]
     if capture.checksums:
         document["checksums"] = dict(capture.checksums)
     return document
@@ -180,6 +183,33 @@ def _sweep(node: Node, lights: Mapping[str, Light]) -> Sweep:
         dark=node.optional("dark", read.nullable(read.file), None),
         sha256=_sweep_checksums(node, arrays, video),
     )
+
+
+def _bracketed(sweeps: list[Sweep]) -> tuple[Sweep, ...]:
+    """The sweeps, those that are exposures of one another under the first of them."""
+    groups: list[list[Sweep]] = []
+    for sweep in sweeps:
+        group = next((group for group in groups if all(_is_bracket(other, sweep) for other in group)), None)
+        if group is None:
+            groups.append([sweep])
+        else:
+            group.append(sweep)
+    return tuple(replace(group[0], bracket=tuple(group[1:])) for group in groups)
+
+
+def _is_bracket(a: Sweep, b: Sweep) -> bool:
+    """Whether two sweeps have the same frames at different exposures, as far as the manifest tells."""
+    if (a.light, a.kind, a.direction, a.count) != (b.light, b.kind, b.direction, b.count):
+        return False
+    if a.exposure_s is None or b.exposure_s is None or a.exposure_s == b.exposure_s:
+        return False
+    if a.position_mm is None or b.position_mm is None:
+        return True
+    known = [(x, y) for x, y in zip(a.position_mm, b.position_mm, strict=True) if x is not None and y is not None]
+    if len(known) < 2:
+        return True
+    step_mm = abs(known[-1][0] - known[0][0]) / (len(known) - 1)
+    return max(abs(x - y) for x, y in known) <= SAME_PLACE * step_mm
 
 
 def _is_list(node: Node, key: str) -> bool:

@@ -46,7 +46,9 @@ def captured(separation: Separation, capture: Capture | None, heldout: Mapping[s
                 f"{sweep.light} along {sweep.direction}",
                 sweep.kind,
                 f"{sweep.count} frames" + (f", {len(sweep.lost)} lost" if sweep.lost else ""),
-                "not recorded" if sweep.exposure_s is None else f"{sweep.exposure_s:g} s",
+                "not recorded"
+                if sweep.exposure_s is None
+                else ", ".join(f"{one.exposure_s:g} s" for one in sweep.exposures),
                 "yes" if sweep.dark else "no",
             ]
             for sweep in capture.sweeps

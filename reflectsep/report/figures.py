@@ -68,6 +68,8 @@ class HeldOut:
     """Pixels of the object that the numbers are over; leave clipped ones out. All of the object where None."""
     others: Mapping[str, Float[Tensor, "channels height width"]] = field(default_factory=dict)
     """The same light by other methods, by name."""
+    note: str = ""
+    """What was done to the real picture."""
 
 
 def write_comparison(

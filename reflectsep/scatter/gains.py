@@ -14,6 +14,7 @@ from reflectsep.scatter.exponent import GRID, UNKNOWN_SD, Exponent, Samples, com
 from reflectsep.scatter.frames import name_of
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage
+from reflectsep.scatter.width import lit_frames
 
 MOST_SAMPLES = 20000
 FEWEST_SAMPLES = 24
@@ -120,9 +121,11 @@ def _geometry_warning(passage: Passage, frames: float, mask: Tensor) -> str:
 
 
 def _lit_frames(passage: Passage, mask: Tensor) -> float:
-    """Median over the pixels whose profile is as narrow as the slab."""
+    """Counted over pixels whose lit interval is clear; else the median of profiles as narrow as the slab."""
     values = passage.lit_frames[mask]
-    return max(1.0, float(values[values < 2.0 * values.median()].median()))
+    guess = max(1.0, float(values[values < 2.0 * values.median()].median()))
+    narrow = passage.narrow & mask
+    return lit_frames(passage.kept, passage.centre, narrow, guess=guess, step_px=passage.step_px(mask)) or guess
 
 
 def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tensor) -> Samples | None:

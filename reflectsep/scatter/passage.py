@@ -20,6 +20,7 @@ from reflectsep.data import FrameStream, Sweep
 from reflectsep.errors import SweepError
 from reflectsep.progress import Progress
 from reflectsep.scatter.frames import Step, name_of, steps
+from reflectsep.scatter.width import Keeper, Kept
 
 MIN_FRAMES = 5
 CACHED = 1 << 15
@@ -59,6 +60,8 @@ class Passage:
     """Sums of the frames' roots at the sampled values, one row an exponent (for Eq. 25)."""
     lost_away: Float[Tensor, "height width"]
     """Frames between a pixel's lit interval and the nearest lost frame; infinite where none was lost."""
+    kept: Kept
+    """Frames of some pixels."""
 
     def lost_near(self, frames: float = 2.0) -> Bool[Tensor, "height width"]:
         """A frame near its passage was lost: its sum is not that of Eq. 25."""
@@ -97,15 +100,16 @@ def watch(
     grey = full.mean(0)
     floor = 0.01 * float(grey[mask].abs().quantile(0.99)) if mask.any() else 1.0
     scale = grey.clamp(min=max(floor, 1e-12))
-    sums = _Sums(full, scale, exponents, samples)
+    sums, keeper = _Sums(full, scale, exponents, samples), Keeper(mask)
     received = 0
     for step in steps(stream, full, mask):
         sums.add(step)
+        keeper.add(step)
         received += not step.lost
         progress(f"sweep {stream.sweep.light} {stream.sweep.direction}: passage", step.index + 1, len(stream))
     if received < MIN_FRAMES:
         raise SweepError(f"{name_of(stream.sweep)}: {received} frames, expected at least {MIN_FRAMES}")
-    return sums.passage(stream.sweep, mask, received)
+    return sums.passage(stream.sweep, mask, received, keeper.kept())
 
 
 class _Sums:
@@ -157,7 +161,7 @@ class _Sums:
             a, b, c = self.recent
             self.noises.append(float(1.4826 * (a - 2 * b + c).abs().median() / 6**0.5))
 
-    def passage(self, sweep: Sweep, mask: Tensor, received: int) -> Passage:
+    def passage(self, sweep: Sweep, mask: Tensor, received: int, kept: Kept) -> Passage:
         centroid = (self.q4t / self.q4.clamp(min=1e-30)).to(self.scale.dtype)
         lit = (self.q4**2 / self.q8.clamp(min=1e-60)).to(self.scale.dtype)
         centre = _smooth(centroid, _trust(lit, self.peak, mask))
@@ -179,6 +183,7 @@ class _Sums:
             noise=float(torch.tensor(self.noises).quantile(0.25)) if self.noises else 0.0,
             sums=self.sums,
             lost_away=lost_away,
+            kept=kept,
         )
 
 

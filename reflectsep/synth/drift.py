@@ -91,9 +91,16 @@ def pose(drift: Drift, name: str, *, seed: int, size: tuple[int, int], still: Po
 
 
 def moved(
-    picture: Float[Tensor, "channels height width"], matrix: Float[Tensor, "3 3"]
+    picture: Float[Tensor, "channels fine_height fine_width"], matrix: Float[Tensor, "3 3"], oversample: int = 1
 ) -> Float[Tensor, "channels height width"]:
-    """The picture as a camera at `matrix` takes it; black beyond its edge."""
+    """The picture as a camera at `matrix` (pixels) takes it; black beyond its edge.
+
+    `picture` has `oversample` patches along a pixel's side; it is moved as it is, and its pixels take their mean then.
+    """
+    if oversample > 1:
+        fine = torch.tensor([[oversample, 0, (oversample - 1) / 2], [0, oversample, (oversample - 1) / 2], [0, 0, 1]])
+        fine = fine.to(matrix)
+        return binned(moved(picture, fine @ matrix @ torch.linalg.inv(fine)), oversample)
     if torch.equal(matrix, torch.eye(3, dtype=matrix.dtype)):
         return picture
     height, width = picture.shape[1:]
@@ -112,6 +119,15 @@ def moved(
             index = (v.clamp(0, height - 1) * width + u.clamp(0, width - 1)).long().flatten()
             result += flat[:, index].view(-1, height, width) * (across[i] * down[j] * within)
     return result.to(picture.dtype)
+
+
+def binned(
+    picture: Float[Tensor, "channels fine_height fine_width"], oversample: int
+) -> Float[Tensor, "channels height width"]:
+    """Means of blocks of `oversample` by `oversample` values."""
+    if oversample == 1:
+        return picture
+    return torch.nn.functional.avg_pool2d(picture[None].double(), oversample)[0].to(picture.dtype)
 
 
 def _lagrange(place: Tensor) -> list[Tensor]:

@@ -22,7 +22,7 @@ from reflectsep.io.exr import write_channels
 from reflectsep.io.files import write_json
 from reflectsep.io.pictures import write_picture
 from reflectsep.synth.camera import exposed, noise, store, suffix
-from reflectsep.synth.drift import Pose, moved, pose
+from reflectsep.synth.drift import Pose, binned, moved, pose
 from reflectsep.synth.objects import SimulatedObject
 from reflectsep.synth.rig import SimulatedRig
 
@@ -32,7 +32,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedPictures:
-    """Noise-free pictures in the capture's units: of every light, held-out ones included."""
+    """Noise-free pictures in the capture's units: of every light, held-out ones included.
+
+    With as many patches along a pixel's side as the camera's `oversample` says.
+    """
 
     object: str
     mask: Bool[Tensor, "height width"]
@@ -72,7 +75,7 @@ def write_capture(
     Args:
         folder: An existing folder.
         rig: What took the pictures.
-        pictures: Noise-free pictures.
+        pictures: Noise-free pictures, before the camera adds up each pixel's patches.
         frames: Every frame of every sweep, in any order.
         seed: Of the noise.
         progress: Told about the stage "frames".
@@ -83,19 +86,21 @@ def write_capture(
     Raises:
         SettingsError: a full picture is not finite, or all its pixels are zero.
     """
-    camera, shape = rig.camera, next(iter(pictures.full.values())).shape
+    camera, fine = rig.camera, rig.camera.oversample
+    shape = binned(next(iter(pictures.full.values())), fine).shape
     _check(pictures)
     poses = poses_of(rig, (shape[2], shape[1]), seed)
     for light in rig.lights:
         name = f"full/{light.name}"
-        seen = moved(pictures.full[light.name], poses[name].matrix)
+        seen = moved(pictures.full[light.name], poses[name].matrix, fine)
         picture = exposed(camera, seen, camera.full_exposure_s, sigma=camera.full_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
     if camera.has_dark:
         _write_dark(rig, folder, "dark", camera.full_exposure_s, shape, seed)
         if rig.sweeps:
             _write_dark(rig, folder, "dark_sweep", camera.slab_exposure_s, shape, seed)
-    write_picture(folder / "mask.png", pictures.mask[None].to(torch.float32))
+    mask = binned(pictures.mask[None].to(torch.float32), fine) >= 0.5
+    write_picture(folder / "mask.png", mask.to(torch.float32))
     _write_truth(folder, rig, pictures)
     if rig.drift.any:
         write_json(folder / "truth" / "drift.json", {name: at.document() for name, at in poses.items()})
@@ -104,7 +109,7 @@ def write_capture(
         place = frame_folder(*rig.sweeps[frame.sweep])
         name = f"{place}/{frame.index:04d}"
         time = 2.0 * frame.index / max(1, pictures.frame_counts[frame.sweep] - 1) - 1.0
-        seen = moved(frame.values, poses[place].at(time))
+        seen = moved(frame.values, poses[place].at(time), fine)
         picture = exposed(camera, seen, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
         if progress:
@@ -144,11 +149,15 @@ def write_layers(path: Path, layers: Mapping[str, Float[Tensor, "channels height
     )
 
 
-def write_geometry(path: Path, obj: SimulatedObject) -> None:
-    """An EXR with channels normal.X, .Y, .Z, depth (height towards the camera, pixels) and material (-1 is outside)."""
+def write_geometry(path: Path, obj: SimulatedObject, oversample: int = 1) -> None:
+    """An EXR with channels normal.X, .Y, .Z, depth (height towards the camera, pixels) and material (-1 is outside).
+
+    Of every pixel the patch next to its middle.
+    """
     planes = {f"normal.{axis}": plane for axis, plane in zip("XYZ", obj.normals, strict=True)}
-    planes |= {"depth": obj.z, "material": obj.material}
-    write_channels(path, {name: plane.to(torch.float32).numpy() for name, plane in planes.items()})
+    planes |= {"depth": obj.z / oversample, "material": obj.material}
+    every = slice(oversample // 2, None, oversample)
+    write_channels(path, {name: plane[every, every].to(torch.float32).numpy() for name, plane in planes.items()})
 
 
 def _check(pictures: SimulatedPictures) -> None:
@@ -173,10 +182,12 @@ def _write_dark(rig: SimulatedRig, folder: Path, name: str, exposure_s: float, s
 
 def _write_truth(folder: Path, rig: SimulatedRig, pictures: SimulatedPictures) -> None:
     for light in rig.heldout:
-        write_picture(folder / "heldout" / f"{light.name}.exr", pictures.full[light.name].to(torch.float32))
+        seen = binned(pictures.full[light.name], rig.camera.oversample)
+        write_picture(folder / "heldout" / f"{light.name}.exr", seen.to(torch.float32))
     write_json(folder / "heldout.json", {"lights": {light.name: _light(light) for light in rig.heldout}})
     for name, components in pictures.components.items():
-        write_layers(folder / "truth" / f"{name}.exr", components)
+        seen = {key: binned(picture, rig.camera.oversample) for key, picture in components.items()}
+        write_layers(folder / "truth" / f"{name}.exr", seen)
 
 
 def _light(light: Light) -> dict[str, object]:
@@ -186,7 +197,7 @@ def _light(light: Light) -> dict[str, object]:
 
 def _manifest(folder: Path, rig: SimulatedRig, pictures: SimulatedPictures) -> Capture:
     camera, ending = rig.camera, suffix(rig.camera)
-    height, width = pictures.mask.shape
+    height, width = (side // camera.oversample for side in pictures.mask.shape)
     images = [
         Picture(kind="full", light=light.name, file=f"full/{light.name}{ending}", exposure_s=camera.full_exposure_s)
         for light in rig.lights

@@ -65,6 +65,9 @@ class SimulatedCamera:
     """Largest value that the sensor gives; None is 1 for integer files and unlimited for float files."""
     gamma: float | None = None
     """Stored value = value^(1/gamma); None is linear."""
+    oversample: int = 1
+    """Patches along a pixel's side, whose light it adds up. A camera that moves sees an edge of light pass over its
+    pixels bit by bit; with one patch a pixel such an edge is a step, which no interpolation between pixels can move."""
 
     def __post_init__(self) -> None:
         """Refuse a camera that cannot be."""
@@ -79,6 +82,7 @@ class SimulatedCamera:
         _require(
             self.bits is None or (self.saturation or 1) <= 1, f"saturation {self.saturation}", "at most 1 with bits"
         )
+        _require(self.oversample >= 1, f"{self.oversample} patches along a pixel", "at least 1")
         _require(self.gamma is None or self.gamma > 0, f"gamma {self.gamma}", "above 0")
 
     @property

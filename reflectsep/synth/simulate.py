@@ -59,7 +59,7 @@ def simulate(
     """Write a capture of `obj` by `rig`, with held-out pictures and truth (layout: `synth.folder`).
 
     Args:
-        obj: What is seen.
+        obj: What is seen; with the camera's `oversample` patches along each of its pixels.
         rig: What sees it.
         out: Folder to make.
         seed: Of all noise; the same seed makes the same files.
@@ -80,7 +80,7 @@ def simulate(
         lit = _light_up(obj, scattering, lights, progress)
         pictures, scale = _pictures(obj, rig, scattering, lit, progress)
         write_capture(folder, rig, pictures, _frames(obj, rig, scattering, lit, scale), seed=seed, progress=progress)
-        write_geometry(folder / "truth" / "geometry.exr", obj)
+        write_geometry(folder / "truth" / "geometry.exr", obj, rig.camera.oversample)
         write_json(folder / "truth" / "simulation.json", _facts(obj, rig, scattering, scale, seed))
     return Path(out)
 
@@ -130,7 +130,7 @@ def _pictures(
     progress: Progress | None,
 ) -> tuple[SimulatedPictures, float]:
     """Noise-free pictures of every light, scaled, and the scale: values per unit of radiance."""
-    wandering = _wandering(scattering, lit, progress)
+    wandering = _wandering(scattering, lit, rig.camera.oversample, progress)
     full = {name: light.direct + wandering["scattering"][name] for name, light in lit.items()}
     values = torch.cat([full[light.name].flatten() for light in rig.lights]).numpy()
     bright = float(np.quantile(values, 0.999))
@@ -157,14 +157,14 @@ def _pictures(
 
 
 def _wandering(
-    scattering: Transport, lit: Mapping[str, Illuminated], progress: Progress | None
+    scattering: Transport, lit: Mapping[str, Illuminated], oversample: int, progress: Progress | None
 ) -> dict[str, dict[str, Float[Tensor, "channels patches"]]]:
     """Scattering of every light: all of it, and that beyond each of `BEYOND_PX`."""
     columns = torch.stack([light.entering for light in lit.values()], -1)
     keys = {"scattering": 0, **{f"scattering_beyond_{px}px": px for px in BEYOND_PX}}
     result = {}
     for index, (key, px) in enumerate(keys.items()):
-        spread = scattering.spread(columns, px)
+        spread = scattering.spread(columns, px * oversample)
         result[key] = {name: light.intensity[:, None] * spread[..., at] for at, (name, light) in enumerate(lit.items())}
         if progress:
             progress("transport", index + 1, len(keys))
@@ -176,7 +176,8 @@ def _lit_by_slab(
 ) -> Bool[Tensor, "patches frames"]:
     towards: Vector | None = rig.lights_by_name[light].direction
     assert towards is not None  # a rig has no light without one
-    return slab_frames(obj.points, towards, axis, rig.slab_width_px, rig.slab_step_px)
+    fine = rig.camera.oversample
+    return slab_frames(obj.points, towards, axis, rig.slab_width_px * fine, rig.slab_step_px * fine)
 
 
 def _frames(

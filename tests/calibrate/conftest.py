@@ -1,5 +1,6 @@
 """A capture folder of a small bumpy object under seven lights, stored as a test wants it."""
 
+import json
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -7,9 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from reflectsep.calibrate.motion import Motion
 from reflectsep.data import Capture, Encoding, Light, Picture, Sweep
 from reflectsep.io.capture import load_capture, write_manifest
 from reflectsep.io.pictures import write_picture
+from reflectsep.synth.presets import make_object
+from reflectsep.synth.rig import SimulatedCamera, make_rig
+from reflectsep.synth.simulate import simulate
 
 SIZE = 40
 ANGLES = {
@@ -34,6 +39,26 @@ def radiance(vector, channels=1):
     normal = torch.stack([x + 0.1 * torch.sin(9 * x), y, torch.full_like(x, 1.2)])
     shading = torch.einsum("chw,c->hw", normal / normal.norm(dim=0), torch.tensor(vector))
     return (0.5 * shading.clamp_min(0))[None].repeat(channels, 1, 1)
+
+
+def simulated(folder, name="pudding", drift=None, size=64, **camera):
+    """A capture with its truth."""
+    rig = make_rig(
+        "r",
+        heldout=(0, 0),
+        sweeps=(3, 0),
+        slab_px=(8.0, 4.0),
+        camera=SimulatedCamera(full_sigma=0.005, frame_sigma=0.002, **camera),
+        drift=drift,
+    )
+    simulate(make_object(name, size=size), rig, folder, seed=3)
+    return load_capture(folder)
+
+
+def truth(capture, name):
+    document = json.loads((capture.folder / "truth" / "drift.json").read_text())[name]
+    matrix = torch.tensor(document["matrix"], dtype=torch.float64)
+    return Motion(matrix=matrix, velocity=tuple(document["velocity_px"]))
 
 
 @dataclass

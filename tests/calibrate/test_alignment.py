@@ -6,35 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from reflectsep.calibrate.alignment import AlignOptions, add_frames, align, aligned_stream, covered
+from reflectsep.calibrate.align_options import AlignOptions
+from reflectsep.calibrate.alignment import align, aligned_stream, covered
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.motion import Motion, displacement, shifted
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures
 from reflectsep.data import Frame, Sweep
-from reflectsep.errors import CaptureError
 from reflectsep.flags import Flag
-from reflectsep.io.capture import load_capture
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.stack import read_full, read_mask
 from reflectsep.synth.drift import Drift
-from reflectsep.synth.presets import make_object
-from reflectsep.synth.rig import SimulatedCamera, make_rig
-from reflectsep.synth.simulate import simulate
+
+from .conftest import simulated, truth
 
 EYE = torch.eye(3, dtype=torch.float64)
-
-
-def simulated(folder, name="pudding", drift=None, size=64, **camera):
-    rig = make_rig(
-        "r",
-        heldout=(0, 0),
-        sweeps=(3, 0),
-        slab_px=(8.0, 4.0),
-        camera=SimulatedCamera(full_sigma=0.005, frame_sigma=0.002, **camera),
-        drift=drift,
-    )
-    simulate(make_object(name, size=size), rig, folder, seed=3)
-    return load_capture(folder)
 
 
 def aligned(capture, options=None):
@@ -43,12 +28,6 @@ def aligned(capture, options=None):
     pictures, clipped = develop_pictures(capture, raw, response)
     streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
     return align(capture, raw.names, pictures, clipped, read_mask(capture), streams, options=options)
-
-
-def truth(capture, name):
-    document = json.loads((capture.folder / "truth" / "drift.json").read_text())[name]
-    matrix = torch.tensor(document["matrix"], dtype=torch.float64)
-    return Motion(matrix=matrix, velocity=tuple(document["velocity_px"]))
 
 
 @pytest.fixture(scope="module")
@@ -170,40 +149,6 @@ def test_clipped_frames_are_not_registered_and_say_so(tmp_path):
     assert not any(motion.applied for motion in result.sweeps)
     assert any("not registered, clipped in" in text for text in result.warnings)
     assert any("scattering itself is cut off" in text for text in result.warnings)
-
-
-def test_sum_knows_when_the_slab_passed_and_what_is_lost():
-    class Passing:
-        sweep = Sweep(light="L1", frames="{}.exr", count=11, lost=frozenset({5}))
-
-        def __len__(self):
-            return 11
-
-        def __iter__(self):
-            for index in range(11):
-                if index != 5:
-                    values = torch.full((1, 4, 22), 0.01)
-                    values[..., 2 * index : 2 * index + 2] = 1.0
-                    yield Frame(index=index, values=values)
-
-    added = add_frames(Passing())
-    assert added.time[0, 0] == pytest.approx(-1.0, abs=1e-3)
-    assert added.time[0, 21] == pytest.approx(1.0, abs=1e-3)
-    assert added.usable[0].tolist() == [abs(i // 2 - 5) > 3 for i in range(22)]
-
-
-def test_a_sweep_without_frames_is_refused():
-    class Nothing:
-        sweep = Sweep(light="L1", frames="{}.exr", count=1)
-
-        def __len__(self):
-            return 1
-
-        def __iter__(self):
-            return iter(())
-
-    with pytest.raises(CaptureError, match="sweep of L1 along x: no frames"):
-        add_frames(Nothing())
 
 
 def test_document_names_the_reference_and_every_motion(drifted, found):

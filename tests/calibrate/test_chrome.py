@@ -11,7 +11,6 @@ from reflectsep.calibrate.chrome import (
     compare_lights,
     diffuse_lights,
     disc,
-    find_ball,
     find_circle,
     highlight,
     reflected,
@@ -70,12 +69,6 @@ def test_circle_of_a_mask_with_a_stand():
     circle = find_circle(mask)
     assert (circle.x, circle.y, circle.radius) == pytest.approx((BALL.x, BALL.y, BALL.radius), abs=0.3)
     assert circle.support < 1
-
-
-def test_ball_is_found_in_the_pictures():
-    mask = find_ball(torch.stack([chrome(v) for v in LIGHTS.values()]))
-    circle = find_circle(mask)
-    assert (circle.x, circle.y, circle.radius) == pytest.approx((BALL.x, BALL.y, BALL.radius), abs=1.5)
 
 
 def test_a_square_is_no_ball():

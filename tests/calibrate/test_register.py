@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reflectsep.calibrate.motion import displacement, shifted
-from reflectsep.calibrate.register import RegisterOptions, register
+from reflectsep.calibrate.register import register
+from reflectsep.calibrate.register_options import RegisterOptions
 from reflectsep.errors import CaptureError
 from reflectsep.synth.drift import moved
 

@@ -14,7 +14,7 @@ from reflectsep.solve.problem import forward_jacobian
 PIXELS, LIGHTS = 40, 7
 
 
-def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clipped=False):
+def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clipped=False, swept=(), alphas=False):
     """Observations, priors and parameters without any structure; shadows, lobes and clipped values among them."""
     g = torch.Generator().manual_seed(7)
 
@@ -37,6 +37,7 @@ def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clip
         lights_known=lights_known,
         n_d=n_d,
         s_unknown=s_unknown,
+        swept=swept,
     )
     priors = Priors(
         shape=7.0,
@@ -52,6 +53,8 @@ def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clip
     d = rand(PIXELS, channels, 3) * 1.2 - 0.4
     local = Locals(d, rand(PIXELS) * 2.0, rand(PIXELS, channels, 3) * 0.3 if s_unknown else None).pack()
     shared = torch.tensor([-0.2, -0.3, -0.25, 1.1, 0.3, 0.4, 0.5, -0.1], dtype=torch.float64)
+    if alphas:
+        shared = torch.cat([shared, 0.2 * rand(3 * (LIGHTS - 3)) - 0.1])
     return obs, priors, local, shared
 
 
@@ -64,6 +67,9 @@ def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clip
         {"s_unknown": True, "n_d": None},
         {"channels": 3, "n_d": 0.8, "clipped": True},
         {"lights_known": False, "n_d": None, "channels": 3},
+        {"alphas": True},
+        {"alphas": True, "lights_known": False, "channels": 3, "s_unknown": True},
+        {"alphas": True, "n_d": 0.8, "clipped": True, "s_unknown": True, "swept": (True,) * 4 + (False,) * 3},
     ],
     ids=str,
 )
@@ -81,6 +87,7 @@ def test_closed_form_is_the_derivative(case, softness, root_haze):
         torch.testing.assert_close(mine, reference, rtol=1e-9, atol=1e-9)
     # Every unknown is felt by the pictures, or the comparison would be of zeros.
     assert (J[:, : obs.images[0].numel()].abs().amax((0, 1)) > 0).all()
+    assert (K[:, : obs.images[0].numel(), 8:].abs().amax((0, 1)) > 0).all()
 
 
 def test_the_fit_uses_the_closed_form():

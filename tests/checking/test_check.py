@@ -10,7 +10,9 @@ import torch
 from reflectsep import pipeline
 from reflectsep.calibrate.chrome import Circle, disc, sphere_normals
 from reflectsep.calibrate.exposure import response_of
-from reflectsep.checking import check_capture, graded, table
+from reflectsep.checking.check import check_capture
+from reflectsep.checking.display import table
+from reflectsep.checking.findings import graded
 from reflectsep.cli import main
 from reflectsep.config import CalibrateJob, CheckJob, ObjectSettings, RigSettings, SimulateJob
 from reflectsep.errors import CaptureError, ResultError, SettingsError
