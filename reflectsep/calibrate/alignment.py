@@ -28,6 +28,7 @@ from reflectsep.calibrate.motion import MODELS, Model, Motion, displacement, ins
 from reflectsep.calibrate.register import FEWEST_PIXELS, RegisterOptions, Registration, register
 from reflectsep.data import Capture, Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError
+from reflectsep.io.ahead import frames_of
 from reflectsep.progress import Progress, silent
 
 LEAST_PX = 0.05
@@ -346,17 +347,19 @@ def add_frames(stream: FrameStream, n_d: float = 1.0, progress: Progress = silen
     total = moment = mass = times = None
     count = max(2, len(stream))
     received = set()
-    for frame in stream:
-        received.add(frame.index)
-        root = _roots(frame.values, n_d).mean(0).double()
-        weight = root.clamp_min(0) ** 4  # the frames that light a pixel outweigh all others
-        if total is None or moment is None or mass is None or times is None:
-            total, moment, mass, times = (torch.zeros_like(root) for _ in range(4))
-        total, mass = total + root, mass + weight
-        moment = moment + weight * frame.index
-        if frame.saturated is not None:
-            times = times + frame.saturated.any(0)
-        progress(f"alignment {stream.sweep.light} {stream.sweep.direction}", frame.index + 1, len(stream))
+    with frames_of(stream) as frames:
+        for frame in frames:
+            received.add(frame.index)
+            root = _roots(frame.values, n_d).mean(0).double()
+            if total is None or moment is None or mass is None or times is None:
+                total, moment, mass, times = (torch.zeros_like(root) for _ in range(4))
+            total += root
+            weight = root.clamp_(min=0).square_().square_()  # the frames that light a pixel outweigh all others
+            mass += weight
+            moment.add_(weight, alpha=frame.index)
+            if frame.saturated is not None and frame.saturated.any():
+                times += frame.saturated.any(0)
+            progress(f"alignment {stream.sweep.light} {stream.sweep.direction}", frame.index + 1, len(stream))
     if total is None or moment is None or mass is None or times is None:
         raise CaptureError(f"sweep of {stream.sweep.light} along {stream.sweep.direction}: no frames")
     passed = moment / mass.clamp_min(1e-300)
@@ -398,9 +401,12 @@ class AlignedStream:
 
     def __iter__(self):
         last = max(1, len(self.stream) - 1)
-        for frame in self.stream:
-            values, saturated, _ = warp(frame.values, self.motion.at(2 * frame.index / last - 1), frame.saturated)
-            yield Frame(index=frame.index, values=values, saturated=saturated)
+        with frames_of(self.stream) as frames:
+            for frame in frames:
+                # Where nothing is clipped, nothing of that is resampled.
+                clipped = None if frame.saturated is None or not frame.saturated.any() else frame.saturated
+                values, saturated, _ = warp(frame.values, self.motion.at(2 * frame.index / last - 1), clipped)
+                yield Frame(index=frame.index, values=values, saturated=saturated)
 
 
 def aligned_stream(stream: FrameStream, motion: Motion) -> FrameStream:

@@ -89,9 +89,12 @@ def developed(
         pixels, largest = pixels.astype(np.uint8), 1
     if pixels.dtype in (np.uint8, np.uint16):
         largest = largest or int(np.iinfo(pixels.dtype).max)
-        # The quotient in double precision, rounded once: k / largest is the same float32 however it is made.
-        values = (pixels / float(largest)).astype(np.float32)
-        return torch.from_numpy(values), torch.from_numpy(np.ascontiguousarray(pixels >= largest))
+        # A quotient of two exact floats, rounded once: k / largest is the same float32 however it is made.
+        values = np.empty(pixels.shape, dtype=np.float32)
+        np.divide(pixels, np.float32(largest), out=values)
+        clipped = np.empty(pixels.shape, dtype=bool)
+        np.greater_equal(pixels, largest, out=clipped)
+        return torch.from_numpy(values), torch.from_numpy(clipped)
     if not np.issubdtype(pixels.dtype, np.floating):
         raise CaptureError(f"{path}: pixels of type {pixels.dtype}; 8 or 16 unsigned bits or floats were expected")
     with np.errstate(over="ignore"):

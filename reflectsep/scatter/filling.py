@@ -29,20 +29,18 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from kornia.filters import gaussian_blur2d
 from kornia.morphology import dilation
 from torch import Tensor
 
-from reflectsep.scatter.band import Evidence, Profiles
+from reflectsep.scatter.evidence import Evidence, Mask, Picture
 from reflectsep.scatter.frames import Step
 from reflectsep.scatter.kernel import Slab, fill_by_profile
+from reflectsep.scatter.windows import Profiles
 
 CALM_STEPS = 0.75
 """Standard deviation of the smoothing of filled profiles, in steps of the slab."""
-
-Picture = Float[Tensor, "channels height width"]
-Mask = Bool[Tensor, "height width"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,29 +79,26 @@ def interpolation(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG
 
 def time(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
     """Every pixel's lit frames by a straight line."""
-    profiles = evidence.profiles()
-    return evidence.picture(profiles.measured + fill_along_time(profiles))
+    return evidence.fill(fill_along_time)
 
 
 def orthogonal(evidence: Evidence, setting: Setting) -> Picture:
     """Every pixel's lit frames by what the other sweep saw beside its own."""
     if setting.partner is None:
         return time(evidence, setting)
-    profiles = evidence.profiles()
-    before, after, _, _ = _neighbours(setting.partner.profiles())
-    count = profiles.hole.sum(0)
-    beside = _mean_of(_at_middle(before), _at_middle(after))
-    return evidence.picture(profiles.measured + setting.partner_gain * beside * count)
+    beside = setting.partner_gain * setting.partner.gather(_beside).flatten(1)
+    return evidence.fill(lambda profiles: beside[:, profiles.at] * profiles.hole.sum(0))
 
 
 def profile(evidence: Evidence, setting: Setting) -> Picture:
     """Every pixel's lit frames by its fitted profile."""
-    profiles = evidence.profiles()
-    distance = setting.distance_px
-    if setting.stretch is not None:
-        distance = distance * setting.stretch[evidence.mask]
-    fill = fill_by_profile(profiles, setting.slab, distance_px=distance, noise=setting.noise)
-    return calmed(evidence.picture(profiles.measured + fill), evidence.mask, CALM_STEPS / setting.slab.frames_per_px)
+    stretch = None if setting.stretch is None else setting.stretch.flatten()
+
+    def fill(profiles: Profiles) -> Tensor:
+        distance = setting.distance_px if stretch is None else setting.distance_px * stretch[profiles.at]
+        return fill_by_profile(profiles, setting.slab, distance_px=distance, noise=setting.noise)
+
+    return calmed(evidence.fill(fill), evidence.mask, CALM_STEPS / setting.slab.frames_per_px)
 
 
 def calmed(root: Picture, mask: Mask, sigma_px: float) -> Picture:
@@ -220,8 +215,10 @@ def _neighbours(profiles: Profiles) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return before, after, since, until
 
 
-def _at_middle(values: Tensor) -> Tensor:
-    return values[len(values) // 2]
+def _beside(profiles: Profiles) -> Float[Tensor, "channels P"]:
+    """Mean of the last value before and the first after the middle frame that are no holes."""
+    before, after, _, _ = _neighbours(profiles)
+    return _mean_of(before[len(before) // 2], after[len(after) // 2])
 
 
 def _mean_of(a: Tensor, b: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.scatter.band import Profiles
+from reflectsep.scatter.windows import Profiles
 
 SMALLEST_SCALE = 0.35
 LARGEST_SCALE = 2.8

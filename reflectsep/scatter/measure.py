@@ -20,7 +20,8 @@ from reflectsep.data import FrameStream, PhotometricStack, Scattering, SweepRepo
 from reflectsep.errors import SweepError
 from reflectsep.flags import Flag, mark
 from reflectsep.progress import Progress, silent
-from reflectsep.scatter.band import Evidence, LitBand
+from reflectsep.scatter.band import LitBand
+from reflectsep.scatter.evidence import Evidence
 from reflectsep.scatter.exponent import complete
 from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
