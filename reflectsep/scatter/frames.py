@@ -33,7 +33,7 @@ class Step:
 
 def signed_root(values: Tensor, n_d: float) -> Tensor:
     """sign(I) |I|^(1/n_d): noise around zero stays around zero in a sum over frames."""
-    return values if n_d == 1.0 else values.sign() * values.abs().pow(1.0 / n_d)
+    return values if n_d == 1.0 else values.abs().pow_(1.0 / n_d).copysign_(values)
 
 
 def name_of(sweep: Sweep) -> str:

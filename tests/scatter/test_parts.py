@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from reflectsep.scatter.exponent import GRID, Samples, solve_exponent
 from reflectsep.scatter.filling import fill_along_time, fill_by_interpolation, fill_by_maximum
 from reflectsep.scatter.frames import signed_root, steps
-from reflectsep.scatter.kernel import Slab, beyond, fill_by_profile, line_response, nonnegative_least_squares
+from reflectsep.scatter.kernel import Slab, beyond, fill_by_profile, line_response
 from reflectsep.scatter.windows import Profiles
+from reflectsep.solve.nonnegative import nonnegative_least_squares
 
 
 @given(st.floats(1e-6, 4).flatmap(lambda v: st.sampled_from([v, -v, 0.0])), st.floats(0.3, 3))
@@ -48,7 +49,7 @@ def test_nonnegative_least_squares_is_optimal():
     a = torch.rand(12, 4, 50, dtype=torch.float64)
     y = torch.rand(12, 50, dtype=torch.float64) - 0.2
     normal, right = torch.einsum("fip,fjp->ijp", a, a), torch.einsum("fip,fp->ip", a, y)
-    x = nonnegative_least_squares(normal, right, passes=2000)
+    x = nonnegative_least_squares(normal, right)
     gradient = torch.einsum("ijp,jp->ip", normal, x) - right
     assert (x >= 0).all()
     # Karush-Kuhn-Tucker: no slope where free, none downhill where held.
