@@ -41,7 +41,7 @@ from reflectsep.solve.nonnegative import nonnegative_least_squares
 
 SMALLEST_SCALE = 0.35
 LARGEST_SCALE = 2.8
-CHUNK = 1 << 12
+CHUNK = 1 << 13
 MODEL_ERROR = 0.05
 """Relative error of the sum of exponentials; noise counts against it."""
 RIDGE = 1e-3

@@ -24,6 +24,7 @@ from reflectsep.data import FrameStream, Sweep
 from reflectsep.errors import SweepError
 from reflectsep.progress import Progress
 from reflectsep.scatter.frames import Step, name_of, steps
+from reflectsep.scatter.local import quantile
 
 MIN_FRAMES = 5
 CACHED = 1 << 14
@@ -103,7 +104,7 @@ def watch(
         SweepError: fewer than 5 frames, or a frame that cannot be used.
     """
     grey = full.mean(0)
-    floor = 0.01 * float(grey[mask].abs().quantile(0.99)) if mask.any() else 1.0
+    floor = 0.01 * float(quantile(grey[mask].abs(), 0.99)) if mask.any() else 1.0
     scale = grey.clamp(min=max(floor, 1e-12))
     sums = _Sums(full, mask, scale, exponents, samples)
     received = 0

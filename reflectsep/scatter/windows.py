@@ -57,7 +57,9 @@ class Profiles:
     @property
     def unsound(self) -> Float[Tensor, "channels P"]:
         """Sum of the root frames that are to be filled, as they are."""
-        return torch.einsum("fcp,fp->cp", self.root, (self.hole | ~self.present).to(self.root))
+        unsound = self.hole | ~self.present
+        rows = unsound.any(1).nonzero()[:, 0]
+        return (self.root[rows] * unsound[rows, None]).sum(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -195,14 +197,20 @@ class _Group:
 
 def _lit(band: LitBand, group: _Group, offset: Tensor, at: Tensor) -> Tensor:
     """A doubtful pixel is lit only if its own frames outshine the others: in a shadow those beside it do."""
-    lit, doubtful = band.lit.flatten()[at], band.doubtful.flatten()[at]
-    if not (lit & doubtful).any():
-        return lit
-    value, present = group.root.mean(1), group.present[:, None]
-    own = (offset.abs() <= band.half) & present
-    mean = (value * own).sum(0) / own.sum(0).clamp(min=1)
-    beside = torch.where(present & ~group.hole, value, 0.0).amax(0)
-    return lit & ~(doubtful & own.any(0) & (mean < OUTSHINE * beside))
+    lit = band.lit.flatten()[at]
+    some = (lit & band.doubtful.flatten()[at]).nonzero()[:, 0]
+    if len(some):
+        every = slice(None) if len(some) == len(at) else some
+        hole, value = group.hole[:, every], group.root[:, :, every]
+        value = value[:, 0] if value.shape[1] == 1 else value.mean(1)
+        beside = value.masked_fill(hole | ~group.present[:, None], 0.0).amax(0)
+        # Only the rows in the middle may be the pixel's own.
+        reach, inner = len(offset) // 2, math.ceil(band.half + 0.5)
+        rows = slice(max(0, reach - inner), reach + inner + 1)
+        own = (offset[rows, every].abs() <= band.half) & group.present[rows, None]
+        mean = (value[rows] * own).sum(0) / own.sum(0).clamp(min=1)
+        lit[some] = ~(own.any(0) & (mean < OUTSHINE * beside))
+    return lit
 
 
 class _Light:

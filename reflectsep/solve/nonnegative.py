@@ -17,6 +17,7 @@ from torch import Tensor
 PATIENCE = 3
 """Rounds without fewer unknowns on the wrong side until they change sides one at a time."""
 ROUNDS = 100
+FEWER = 0.7
 
 
 def nonnegative_least_squares(
@@ -67,8 +68,11 @@ class _Pivoting:
         left = count.nonzero()[:, 0]
         if not len(left):
             return False
-        self._keep(left)
-        self._exchange(wrong[:, left], count[left])
+        # The finished may stay: they change no more. Copying the others pays where they are fewer.
+        if len(left) < FEWER * len(count):
+            self._keep(left)
+            wrong, count = wrong[:, left], count[left]
+        self._exchange(wrong, count)
         return True
 
     def _keep(self, left: Tensor) -> None:
