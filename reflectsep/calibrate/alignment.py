@@ -28,7 +28,7 @@ from reflectsep.calibrate.motion import MODELS, Model, Motion, displacement, ins
 from reflectsep.calibrate.register import FEWEST_PIXELS, RegisterOptions, Registration, register
 from reflectsep.data import Capture, Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError
-from reflectsep.io.ahead import frames_of
+from reflectsep.io.ahead import frames_of, one_thread
 from reflectsep.progress import Progress, silent
 
 LEAST_PX = 0.05
@@ -347,7 +347,7 @@ def add_frames(stream: FrameStream, n_d: float = 1.0, progress: Progress = silen
     total = moment = mass = times = None
     count = max(2, len(stream))
     received = set()
-    with frames_of(stream) as frames:
+    with one_thread(), frames_of(stream) as frames:
         for frame in frames:
             received.add(frame.index)
             root = _roots(frame.values, n_d).mean(0).double()

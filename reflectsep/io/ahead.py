@@ -50,8 +50,7 @@ def lead_for(frame_bytes: int) -> Lead:
     if cores == 1:
         return NO_LEAD
     room = max(1, MOST_BYTES // max(1, frame_bytes))
-    # Who keeps torch to one thread wants few: one that reads beside the one that computes.
-    threads = min(cores, torch.get_num_threads(), MOST_THREADS, room)
+    threads = min(cores, MOST_THREADS, room)
     return Lead(threads=threads, held=min(2 * threads, room))
 
 
@@ -89,3 +88,18 @@ def frames_of(stream: FrameStream) -> Iterator[Iterator[Frame]]:
         close = getattr(frames, "close", None)
         if close is not None:
             close()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch keeps to one thread: the other cores decode.
+
+    Work on a frame is many short operations. Shared out they wait for each other, and for the decoding threads: ten
+    times as long in all on two busy cores.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

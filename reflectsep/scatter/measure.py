@@ -18,6 +18,7 @@ from torch import Tensor
 from reflectsep.data import FrameStream, PhotometricStack, Scattering, SweepReport
 from reflectsep.errors import SweepError
 from reflectsep.flags import Flag, mark
+from reflectsep.io.ahead import one_thread
 from reflectsep.progress import Progress, silent
 from reflectsep.scatter.band import LitBand
 from reflectsep.scatter.evidence import Evidence
@@ -79,6 +80,17 @@ def measure_scattering(
     """
     options = options or ScatterOptions()
     lights = _lights(stack, sweeps)
+    with one_thread():
+        return _measured(stack, sweeps, lights, options, progress)
+
+
+def _measured(
+    stack: PhotometricStack,
+    sweeps: Sequence[FrameStream],
+    lights: list[int],
+    options: ScatterOptions,
+    progress: Progress,
+) -> Scattering:
     chosen = choose_samples(stack, lights)
     grid = torch.tensor(exponents(options), dtype=torch.float64)
     passages = [

@@ -22,6 +22,7 @@ from torch.nn.functional import conv2d, max_pool2d
 
 from reflectsep.data import FrameStream, Sweep
 from reflectsep.errors import SweepError
+from reflectsep.io.ahead import one_thread
 from reflectsep.progress import Progress
 from reflectsep.scatter.frames import Step, name_of, steps
 from reflectsep.scatter.local import quantile
@@ -108,7 +109,7 @@ def watch(
     scale = grey.clamp(min=max(floor, 1e-12))
     sums = _Sums(full, mask, scale, exponents, samples)
     received = 0
-    with closing(steps(stream, full, mask)) as walked:
+    with one_thread(), closing(steps(stream, full, mask)) as walked:
         for step in walked:
             sums.add(step)
             received += not step.lost
