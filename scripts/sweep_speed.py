@@ -149,7 +149,7 @@ def analyse(setup: Setup, n_d: float | None) -> Times:
     )
     times = Times()
 
-    def watch(stage: str, done: int, total: int) -> None:
+    def watch(stage: str, done: int, total: int) -> None:  # noqa: ARG001
         # The first frame of a pass comes after what was done once before it.
         times.lap("once" if done == 1 else stage.rsplit(" ", 1)[1])
 
@@ -183,22 +183,19 @@ def compare(setup: Setup, cores: int, rounds: int, n_d: float | None) -> None:
     runs = [(decode(setup), analyse(setup, n_d)) for _ in range(rounds)]
     frames = setup.frames
 
-    def figure(of: Callable[[Times, Times], float]) -> float:
-        return median(of(*run) for run in runs)
+    def ratio(parts: list[str], passes: int) -> str:
+        """Of these parts to as many passes of decoding, by the clock and by the processors."""
+        clock = median(sum(a.clock[p] for p in parts) / passes / d.clock["decode"] for d, a in runs)
+        busy = median(sum(a.processor[p] for p in parts) / passes / d.processor["decode"] for d, a in runs)
+        return f"{clock:6.2f} x decoding ({busy:.2f} x by processor time)"
 
-    alone = figure(lambda d, _: d.clock["decode"])
-    print(f"{cores} core{'s' if cores > 1 else ''}: decoding alone {1e3 * alone / frames:.1f} ms a frame, "
-          f"{frames / alone:.1f} frames a second")  # fmt: skip
-    for part, name, passes in (("passage", "first pass", 3), ("scattering", "second pass", 3), ("once", "once a sweep", 3)):
-        clock = figure(lambda _, a, part=part: a.clock[part]) / passes
-        ratio = figure(lambda d, a, part=part: a.clock[part] / passes / d.clock["decode"])
-        busy = figure(lambda d, a, part=part: a.processor[part] / passes / d.processor["decode"])
-        print(f"  {name:14s} {1e3 * clock / frames:7.1f} ms a frame {ratio:6.2f} x decoding (processors {busy:.2f} x)")
-    whole = figure(lambda d, a: sum(a.clock.values()) / 6 / d.clock["decode"])
-    busy = figure(lambda d, a: sum(a.processor.values()) / 6 / d.processor["decode"])
-    rate = figure(lambda d, a: 3 * frames / sum(a.clock.values()))
-    print(f"  all, against two passes of decoding: {whole:.2f} x (processors {busy:.2f} x); {rate:.1f} frames of a sweep "
-          "a second, both passes")  # fmt: skip
+    alone = median(d.clock["decode"] for d, _ in runs)
+    whole = median(sum(a.clock.values()) / 3 for _, a in runs)
+    print(f"{cores} core{'s' if cores > 1 else ''}: decoding alone {1e3 * alone / frames:.1f} ms a frame, ", end="")
+    print(f"{frames / alone:.1f} frames a second; both passes {frames / whole:.1f} frames a second")
+    for part, name in (("passage", "first pass"), ("scattering", "second pass"), ("once", "once a sweep")):
+        print(f"  {name:36s} {ratio([part], 3)}")
+    print(f"  {'all, to two passes of decoding':36s} {ratio(['passage', 'scattering', 'once'], 6)}")
 
 
 def memory(setup: Setup, n_d: float | None) -> dict[str, float]:

@@ -105,7 +105,7 @@ def _plain(path: Path, name: str, channel: Any) -> np.ndarray:
     if pixels.dtype == np.float16:
         # By torch, which has the processor widen many at a time: numpy takes ten times as long.
         wide = np.empty(pixels.shape, dtype=np.float32)
-        torch.from_numpy(wide).copy_(torch.from_numpy(np.require(pixels, requirements="CW")))
+        torch.from_numpy(wide).copy_(torch.from_numpy(np.require(pixels, requirements=["C", "W"])))
         return wide
     return pixels.astype(pixels.dtype, order="C", copy=True)
 

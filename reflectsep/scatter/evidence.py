@@ -7,7 +7,7 @@ the slab is near are looked at in a frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -71,7 +71,7 @@ class Evidence:
                 result[:, profiles.at] = wanted(profiles).to(result)
         return result.view_as(self.full)
 
-    def _profiles(self, visit: Callable[[Step], None] | None) -> Iterator[Profiles]:
+    def _profiles(self, visit: Callable[[Step], None] | None) -> Generator[Profiles, None, None]:
         windows = Windows(
             View(
                 full=self.full,
@@ -89,7 +89,7 @@ class Evidence:
                 yield from windows.add(step)
         yield from windows.rest()
 
-    def _steps(self) -> Iterator[Step]:
+    def _steps(self) -> Generator[Step, None, None]:
         name = f"sweep {self.stream.sweep.light} {self.stream.sweep.direction}: scattering"
         with closing(steps(self.stream, self.full, self.mask)) as walked:
             for step in walked:

@@ -7,7 +7,7 @@ pixels far from the lit band, where profiles are smooth, and must treat it as a 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -44,7 +44,7 @@ def name_of(sweep: Sweep) -> str:
 
 def steps(
     stream: FrameStream, full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"]
-) -> Iterator[Step]:
+) -> Generator[Step, None, None]:
     """Every step between the first and the last received frame, in order; two frames are held at a time.
 
     Left half-way, it is to be closed (`contextlib.closing`), so that no thread goes on reading.

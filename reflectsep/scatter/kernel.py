@@ -127,8 +127,10 @@ def _fill(profiles: Profiles, channel: int, base: _Base, far: Tensor, noise: flo
 
 
 def _weights(value: Tensor, measured: Tensor, plateau: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Squared weights, of relative errors where the signal is strong, of absolute ones in the noise; those of the
-    plateau's frames alone; and the signal's size."""
+    """Squared weights; those of the plateau's frames alone; and the signal's size.
+
+    They are of relative errors where the signal is strong, of absolute ones in the noise.
+    """
     high = value.abs()
     size = (high * measured).amax(0).clamp_(min=1e-6) + noise / MODEL_ERROR
     lit = plateau / (high * plateau).amax(0).clamp_(min=1e-6) ** 2
@@ -167,7 +169,9 @@ class _Base:
         self.outer = torch.exp((slab.half - rows) / self.scales) * -torch.expm1(-2.0 * slab.half / self.scales)
         """c(k; s) of the rows after the inner ones; of those before them in reverse."""
         u = profiles.offset[self.middle]
-        self.columns = torch.stack([self._inner(row, light) for row, light in zip(u, self.light[self.middle], strict=True)])
+        self.columns = torch.stack(
+            [self._inner(row, light) for row, light in zip(u, self.light[self.middle], strict=True)]
+        )
         self.inside = profiles.offset.abs() <= slab.half - slab.edge
 
     def _powers(self, x: Tensor) -> Float[Tensor, "scales values"]:
@@ -188,7 +192,10 @@ class _Base:
     ) -> tuple[Float[Tensor, "unknowns unknowns values"], Float[Tensor, "unknowns values"]]:
         """Normal equations of E-, E+ and the light that entered at the pixel; weights are squared ones."""
         s, both = len(self.scales), 2 * len(self.scales)
-        normal, right = value.new_zeros((both + 1, both + 1, value.shape[1])), value.new_zeros((both + 1, value.shape[1]))
+        normal, right = (
+            value.new_zeros((both + 1, both + 1, value.shape[1])),
+            value.new_zeros((both + 1, value.shape[1])),
+        )
         lit = weight * self.light
         seen = lit * value
         lit.mul_(self.light)

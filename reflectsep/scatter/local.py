@@ -9,7 +9,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 
-def box_sum(pictures: Float[Tensor, "*channels height width"], size: int = 5) -> Float[Tensor, "*channels height width"]:
+def box_sum(
+    pictures: Float[Tensor, "*channels height width"], size: int = 5
+) -> Float[Tensor, "*channels height width"]:
     """Sum over size x size neighbours, nothing beyond the border."""
     height, width = pictures.shape[-2:]
     reach = size // 2

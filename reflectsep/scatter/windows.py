@@ -50,7 +50,7 @@ class Profiles:
     at: Int[Tensor, "P"]
     """Place of each pixel in the flattened picture."""
 
-    def part(self, pixels: slice) -> Profiles:
+    def part(self, pixels: slice | Tensor) -> Profiles:
         """The same for some of the pixels."""
         return replace(self, **{k: v[..., pixels] for k, v in vars(self).items()})
 

@@ -90,7 +90,7 @@ class _Pivoting:
 
 
 def _solve(normal: Tensor, right: Tensor, free: Tensor) -> Tensor:
-    """x of N x = r over the free unknowns, 0 for the others: LDL^T, the pivots of the others left out."""
+    """X of N x = r over the free unknowns, 0 for the others: LDL^T, the pivots of the others left out."""
     unknowns = len(right)
     # Upper triangle and right side in one, row by row.
     rows = torch.cat([normal, right[:, None]], 1)
