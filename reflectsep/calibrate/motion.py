@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.transform import remap
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 Model = Literal["identity", "translation", "rigid", "affine", "homography"]
 MODELS: tuple[Model, ...] = ("identity", "translation", "rigid", "affine", "homography")
@@ -119,7 +119,7 @@ def sample(
     places: Float[Tensor, "2 height width"],
     mode: Literal["bilinear", "bicubic", "nearest"] = "bicubic",
 ) -> Float[Tensor, "channels height width"]:
-    """The picture at fractional places (column, row); its edge is drawn on outwards. One resampling (kornia).
+    """The picture at fractional places (column, row); its edge is drawn on outwards. One resampling.
 
     Torch's cubic has a = -0.75, which does not even keep a ramp in its place (0.05 px at a quarter of a pixel). The
     family is linear in a, and a = 0 is bilinear interpolation at f^2 (3 - 2 f) in place of the fraction f: two thirds
@@ -134,8 +134,12 @@ def sample(
 
 
 def _remap(picture: Tensor, places: Tensor, mode: str) -> Tensor:
-    x, y = (axis.to(picture.dtype).expand(picture.shape[0], -1, -1) for axis in places)
-    return remap(picture[:, None], x, y, mode=mode, padding_mode="border", align_corners=True)[:, 0]
+    height, width = picture.shape[-2:]
+    grid = torch.empty((1, *places.shape[1:], 2), dtype=picture.dtype)
+    # From -1 to 1 between the middles of the outer pixels; one grid for all channels.
+    for axis, count in enumerate((width, height)):
+        grid[0, ..., axis] = places[axis] * (2.0 / max(count - 1, 1e-14)) - 1.0
+    return grid_sample(picture[None], grid, mode=mode, padding_mode="border", align_corners=True)[0]
 
 
 def inside(places: Float[Tensor, "2 height width"]) -> Bool[Tensor, "height width"]:

@@ -16,8 +16,8 @@ profile        every pixel: its profile as a sum of exponentials (reflectsep/sca
 Relative RMS error on a path-traced wax blob (mean free path 1.44 px, slab 4 px wide, 2 px a frame), lit band by the
 interval in time, against the light that left more than 1 and more than 2 px from where it entered:
 
-    profile at 1 px    5.6 %   22 %      maximum          16 %   10.0 %      time                    27 %   15 %
-    profile at 2 px     22 %  8.2 %      interpolation    22 %    9.0 %      orthogonal (one light)  25 %   11 %
+    profile at 1 px   4.8 %   25 %       maximum        13.8 %  9.7 %       time                    26 %   14 %
+    profile at 2 px    16 %  5.7 %       interpolation    20 %  7.4 %       orthogonal (one light)  25 %   14 %
 
 So `profile` is the default, `interpolation` and `maximum` stand for about half the slab's width, and `time` for more.
 """
