@@ -29,10 +29,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d
-from kornia.morphology import dilation
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from reflectsep.scatter.evidence import Evidence, Mask, Picture
 from reflectsep.scatter.frames import Step
@@ -151,23 +151,38 @@ class _FrameSum:
 
 def fill_by_maximum(frame: Picture, hole: Mask, mask: Mask) -> Picture:
     """The largest value on the rim grows into the hole, a pixel at a time, until it is closed."""
-    kernel = torch.ones(3, 3)
-    known = mask & ~hole
+    known, open_ = mask & ~hole, hole & mask
     if not known.any():
         return frame * ~hole
+    if not open_.any():
+        return frame
+    # Only the holes and their rim are looked at.
+    rows, columns = (_span(open_.any(axis)) for axis in (1, 0))
+    result = frame.clone()
+    result[:, rows, columns] = _grown(frame[:, rows, columns], known[rows, columns], open_[rows, columns])
+    return result
+
+
+def _span(present: Bool[Tensor, "pixels"]) -> slice:
+    """From the first to the last that is present, and one more on either side."""
+    places = present.nonzero()[:, 0]
+    return slice(max(0, int(places[0]) - 1), int(places[-1]) + 2)
+
+
+def _grown(frame: Picture, known: Mask, open_: Mask) -> Picture:
+    if not known.any():
+        return torch.where(open_, 0.0, frame)
     low = float(frame[:, known].min()) - 1.0
     values = torch.where(known, frame, low)
-    open_ = hole & mask
-    for _ in range(sum(frame.shape[-2:])):
-        if not open_.any():
-            break
-        grown = dilation(values[:, None], kernel, engine="convolution")[:, 0]
-        reached = open_ & (grown > low + 0.5).all(0)
-        values = torch.where(reached, grown, values)
-        open_ = open_ & ~reached
+    left = open_
+    while left.any():
+        grown = max_pool2d(values[None], 3, stride=1, padding=1)[0]
+        reached = left & (grown > low + 0.5).all(0)
         if not reached.any():
             break
-    return torch.where(hole & mask & ~open_, values, torch.where(open_, 0.0, frame))
+        values = torch.where(reached, grown, values)
+        left = left & ~reached
+    return torch.where(open_ & ~left, values, torch.where(left, 0.0, frame))
 
 
 def fill_by_interpolation(frame: Picture, hole: Mask, mask: Mask) -> Picture:
