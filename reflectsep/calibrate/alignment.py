@@ -25,6 +25,7 @@ from reflectsep.calibrate.register import RegisterOptions, register
 from reflectsep.calibrate.sweep_sum import SweepSum, add_frames, roots_of
 from reflectsep.data import Capture, Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError
+from reflectsep.io.ahead import frames_of
 from reflectsep.progress import Progress, silent
 
 CLIPPED_SHARE = 0.5
@@ -206,9 +207,12 @@ class AlignedStream:
 
     def __iter__(self):
         last = max(1, len(self.stream) - 1)
-        for frame in self.stream:
-            values, saturated, _ = warp(frame.values, self.motion.at(2 * frame.index / last - 1), frame.saturated)
-            yield Frame(index=frame.index, values=values, saturated=saturated)
+        with frames_of(self.stream) as frames:
+            for frame in frames:
+                # Where nothing is clipped, nothing of that is resampled.
+                clipped = None if frame.saturated is None or not frame.saturated.any() else frame.saturated
+                values, saturated, _ = warp(frame.values, self.motion.at(2 * frame.index / last - 1), clipped)
+                yield Frame(index=frame.index, values=values, saturated=saturated)
 
 
 def aligned_stream(stream: FrameStream, motion: Motion) -> FrameStream:

@@ -9,6 +9,7 @@ frame of each exposure is held at a time. A frame that one exposure lost is that
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from reflectsep.calibrate.bracket import merge
 from reflectsep.data import Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError
+from reflectsep.io.ahead import frames_of
 
 DISAGREE = 0.35
 """Mean difference of two exposures over their mean, where neither is clipped, beyond which they do not show the slab at
@@ -45,7 +47,10 @@ class BracketedStream:
         return len(self.streams[0])
 
     def __iter__(self) -> Iterator[Frame]:
-        passing = [iter(stream) for stream in self.streams]
+        with ExitStack() as open_streams:
+            yield from self._merged([open_streams.enter_context(frames_of(stream)) for stream in self.streams])
+
+    def _merged(self, passing: list[Iterator[Frame]]) -> Iterator[Frame]:
         heads = [next(frames, None) for frames in passing]
         agreement = [_Agreement() for _ in self.streams]
         while any(head is not None for head in heads):

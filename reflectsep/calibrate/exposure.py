@@ -18,10 +18,11 @@ from torch import Tensor
 
 from reflectsep.calibrate.bracket import NEARLY
 from reflectsep.calibrate.bracketed_sweep import BracketedStream
-from reflectsep.calibrate.develop import Response, develop, gamma_response, linear_response, table_response
+from reflectsep.calibrate.develop import Response, gamma_response, linear_response, table_response
 from reflectsep.calibrate.flat import flat_of
 from reflectsep.data import Capture, Frame, FrameStream, Light, Sweep
 from reflectsep.errors import CaptureError
+from reflectsep.io.ahead import frames_of
 from reflectsep.io.files import inside
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.manifest import frame_file
@@ -99,27 +100,38 @@ class DevelopedStream:
         return len(self.stream)
 
     def __iter__(self) -> Iterator[Frame]:
-        for frame in self.stream:
-            name = f"{self.where}/{self._name(frame.index)}"
-            shape = tuple(frame.values.shape)
-            if self.dark is not None and self.dark.shape != frame.values.shape:
-                raise CaptureError(
-                    f"{name}: {shape} (channels, height, width), its dark picture {tuple(self.dark.shape)}"
-                )
-            values = develop(frame.values, self.response, self.dark, self.ratio)
-            colour = colour_of(self.light, shape[0])
-            values = values if colour is None else values / colour.to(values)
-            if self.flat is not None:
-                if self.flat.shape != values.shape:
-                    raise CaptureError(f"{name}: {shape} (channels, height, width), its flat {tuple(self.flat.shape)}")
-                values = values / self.flat.to(values)
-            bad = int((~torch.isfinite(values)).sum())
-            if bad:
-                raise CaptureError(f"{name}: {bad} values are not finite numbers; expected none")
-            saturated = frame.saturated
-            if saturated is not None and math.isfinite(self.limit) and bool(saturated.any()):
-                saturated = saturated | (frame.values > self.limit)
-            yield replace(frame, values=values, saturated=saturated)
+        dark = None if self.dark is None else self.response(self.dark)
+        with frames_of(self.stream) as frames:
+            for frame in frames:
+                name = f"{self.where}/{self._name(frame.index)}"
+                values = self._developed(frame, name, dark)
+                # One sum tells whether any value is no number; how many are is counted only then.
+                if not bool(torch.isfinite(values.sum())):
+                    bad = int((~torch.isfinite(values)).sum())
+                    if bad:
+                        raise CaptureError(f"{name}: {bad} values are not finite numbers; expected none")
+                saturated = frame.saturated
+                if saturated is not None and math.isfinite(self.limit) and bool(saturated.any()):
+                    saturated = saturated | (frame.values > self.limit)
+                yield replace(frame, values=values, saturated=saturated)
+
+    def _developed(self, frame: Frame, name: str, dark: Tensor | None) -> Tensor:
+        """As `develop` does it, the dark picture's response undone once for all frames."""
+        shape = tuple(frame.values.shape)
+        if self.dark is not None and self.dark.shape != frame.values.shape:
+            raise CaptureError(f"{name}: {shape} (channels, height, width), its dark picture {tuple(self.dark.shape)}")
+        values = self.response(frame.values)
+        if dark is not None:
+            values = values - dark.to(values)
+        if self.ratio != 1.0:
+            values = values * self.ratio
+        colour = colour_of(self.light, shape[0])
+        values = values if colour is None else values / colour.to(values)
+        if self.flat is not None:
+            if self.flat.shape != values.shape:
+                raise CaptureError(f"{name}: {shape} (channels, height, width), its flat {tuple(self.flat.shape)}")
+            values = values / self.flat.to(values)
+        return values
 
     def _name(self, index: int) -> str:
         return frame_file(self.sweep, index) if self.sweep.video is None else f"{self.sweep.video}, frame {index}"

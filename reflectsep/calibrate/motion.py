@@ -134,8 +134,9 @@ def sample(
 
 
 def _remap(picture: Tensor, places: Tensor, mode: str) -> Tensor:
-    x, y = (axis.to(picture.dtype).expand(picture.shape[0], -1, -1) for axis in places)
-    return remap(picture[:, None], x, y, mode=mode, padding_mode="border", align_corners=True)[:, 0]
+    x, y = (axis.to(picture.dtype)[None] for axis in places)
+    # The channels as one picture, so that there is one grid for all of them.
+    return remap(picture[None], x, y, mode=mode, padding_mode="border", align_corners=True)[0]
 
 
 def inside(places: Float[Tensor, "2 height width"]) -> Bool[Tensor, "height width"]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from reflectsep.data import FrameStream
 from reflectsep.errors import CaptureError
+from reflectsep.io.ahead import frames_of, one_thread
 from reflectsep.progress import Progress, silent
 
 
@@ -37,17 +38,19 @@ def add_frames(stream: FrameStream, n_d: float = 1.0, progress: Progress = silen
     total = moment = mass = times = None
     count = max(2, len(stream))
     received = set()
-    for frame in stream:
-        received.add(frame.index)
-        root = roots_of(frame.values, n_d).mean(0).double()
-        weight = root.clamp_min(0) ** 4  # the frames that light a pixel outweigh all others
-        if total is None or moment is None or mass is None or times is None:
-            total, moment, mass, times = (torch.zeros_like(root) for _ in range(4))
-        total, mass = total + root, mass + weight
-        moment = moment + weight * frame.index
-        if frame.saturated is not None:
-            times = times + frame.saturated.any(0)
-        progress(f"alignment {stream.sweep.light} {stream.sweep.direction}", frame.index + 1, len(stream))
+    with one_thread(), frames_of(stream) as frames:
+        for frame in frames:
+            received.add(frame.index)
+            root = roots_of(frame.values, n_d).mean(0).double()
+            if total is None or moment is None or mass is None or times is None:
+                total, moment, mass, times = (torch.zeros_like(root) for _ in range(4))
+            total += root
+            weight = root.clamp_(min=0).square_().square_()  # the frames that light a pixel outweigh all others
+            mass += weight
+            moment.add_(weight, alpha=frame.index)
+            if frame.saturated is not None and frame.saturated.any():
+                times += frame.saturated.any(0)
+            progress(f"alignment {stream.sweep.light} {stream.sweep.direction}", frame.index + 1, len(stream))
     if total is None or moment is None or mass is None or times is None:
         raise CaptureError(f"sweep of {stream.sweep.light} along {stream.sweep.direction}: no frames")
     passed = moment / mass.clamp_min(1e-300)

@@ -62,7 +62,7 @@ def pass_over(
     swept = [(stream, stack.names.index(stream.sweep.light)) for stream in streams if stream.sweep.light in stack.names]
     options = ScatterOptions()
     grid = torch.tensor(exponents(options), dtype=torch.float64)
-    chosen = [choose_samples(stack, k) for _, k in swept]
+    chosen = choose_samples(stack, [k for _, k in swept])
     passages: list[Passage] = []
     try:
         for (stream, k), samples in zip(swept, chosen, strict=True):

@@ -16,10 +16,14 @@ import numpy as np
 
 from reflectsep.data import Capture, Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError, MissingExtraError
+from reflectsep.io.ahead import Lead, in_order, lead_for
 from reflectsep.io.files import inside
 from reflectsep.io.manifest import frame_file
 from reflectsep.io.pictures import developed, read_picture, require_checksum
 from reflectsep.io.stack import picture_size, require_channels, require_size
+
+BYTES_A_VALUE = 5
+"""A float and whether it is clipped."""
 
 
 def open_sweep(capture: Capture, sweep: Sweep) -> FrameStream:
@@ -67,20 +71,24 @@ class FileFrames(Shown):
     size: tuple[int, int]
     """(width, height)."""
     channels: int
+    lead: Lead | None = None
+    """How far decoding runs ahead; None: as far as cores and memory allow."""
 
     def __len__(self) -> int:
         return self.sweep.count
 
     def __iter__(self) -> Iterator[Frame]:
-        for index in range(self.sweep.count):
-            if index in self.sweep.lost:
-                continue
-            path = inside(self.folder, frame_file(self.sweep, index))
-            recorded = self.sweep.sha256[index] if self.sweep.sha256 else None
-            values, saturated = read_picture(path, recorded)
-            require_size(path, values, self.size)
-            require_channels(path, values, self.channels)
-            yield Frame(index=index, values=values, saturated=saturated)
+        received = (index for index in range(self.sweep.count) if index not in self.sweep.lost)
+        lead = self.lead or lead_for(self.size[0] * self.size[1] * self.channels * BYTES_A_VALUE)
+        return in_order(self._read, received, lead)
+
+    def _read(self, index: int) -> Frame:
+        path = inside(self.folder, frame_file(self.sweep, index))
+        recorded = self.sweep.sha256[index] if self.sweep.sha256 else None
+        values, saturated = read_picture(path, recorded)
+        require_size(path, values, self.size)
+        require_channels(path, values, self.channels)
+        return Frame(index=index, values=values, saturated=saturated)
 
 
 @dataclass(frozen=True, kw_only=True)

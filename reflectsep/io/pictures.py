@@ -75,6 +75,7 @@ def developed(
     Args:
         path: names the picture in errors.
         pixels: unsigned integers or floats, 1 to 4 channels last; the second of two and the fourth of four are alpha.
+            Contiguous planes of single-precision floats are taken over, not copied.
         largest: value that stands for 1 in an integer picture; by default the largest of its type.
 
     Raises:
@@ -89,16 +90,21 @@ def developed(
         pixels, largest = pixels.astype(np.uint8), 1
     if pixels.dtype in (np.uint8, np.uint16):
         largest = largest or int(np.iinfo(pixels.dtype).max)
-        # The quotient in double precision, rounded once: k / largest is the same float32 however it is made.
-        values = (pixels / float(largest)).astype(np.float32)
-        return torch.from_numpy(values), torch.from_numpy(np.ascontiguousarray(pixels >= largest))
+        # A quotient of two exact floats, rounded once: k / largest is the same float32 however it is made.
+        values = np.empty(pixels.shape, dtype=np.float32)
+        np.divide(pixels, np.float32(largest), out=values)
+        clipped = np.empty(pixels.shape, dtype=bool)
+        np.greater_equal(pixels, largest, out=clipped)
+        return torch.from_numpy(values), torch.from_numpy(clipped)
     if not np.issubdtype(pixels.dtype, np.floating):
         raise CaptureError(f"{path}: pixels of type {pixels.dtype}; 8 or 16 unsigned bits or floats were expected")
     with np.errstate(over="ignore"):
-        values = np.array(pixels, dtype=np.float32, order="C")
-    values[~np.isfinite(values)] = np.nan
-    if np.isnan(values).all():
+        values = np.require(pixels, np.float32, ["C", "W"])
+    finite = np.isfinite(values)
+    if not finite.any():
         raise CaptureError(f"{path}: not one finite value in it")
+    if not finite.all():
+        values = np.where(finite, values, np.float32(np.nan))
     return torch.from_numpy(values), torch.zeros(values.shape, dtype=torch.bool)
 
 
@@ -156,9 +162,9 @@ def _read_exr(path: Path) -> np.ndarray:
     channels = read_channels(path)
     colours = {name: array for name, array in channels.items() if name != "A"}
     if set(colours) == {"R", "G", "B"}:
-        return np.stack([colours[name] for name in "RGB"], axis=-1).astype(np.float32)
+        return np.stack([colours[name] for name in "RGB"]).astype(np.float32, copy=False).transpose(1, 2, 0)
     if len(colours) == 1:
-        return next(iter(colours.values())).astype(np.float32)
+        return next(iter(colours.values())).astype(np.float32, copy=False)
     raise CaptureError(f"{path}: channels {' '.join(channels)}; R G B or a single one was expected")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import torch
@@ -72,17 +73,18 @@ def view_sweep(
     last = torch.zeros(full.shape[1:])
     rising = torch.zeros(full.shape[1:], dtype=torch.bool)
     seen = 0
-    for step in steps(stream, full, stack.mask):
-        grey = step.values.mean(0)
-        around[2] = torch.where(rising, grey, around[2])
-        higher = grey > best
-        around[0], around[1] = torch.where(higher, last, around[0]), torch.where(higher, grey, around[1])
-        best, peak = torch.where(higher, grey, best), torch.where(higher, float(step.index), peak)
-        around[2] = torch.where(higher, grey, around[2])
-        rising, last, seen = higher, grey, seen + 1
-        root_sum += signed_root(step.values, n_d)
-        if step.index in wanted:
-            kept[step.index] = step.values.clone()
+    with closing(steps(stream, full, stack.mask)) as walked:
+        for step in walked:
+            grey = step.values.mean(0)
+            around[2] = torch.where(rising, grey, around[2])
+            higher = grey > best
+            around[0], around[1] = torch.where(higher, last, around[0]), torch.where(higher, grey, around[1])
+            best, peak = torch.where(higher, grey, best), torch.where(higher, float(step.index), peak)
+            around[2] = torch.where(higher, grey, around[2])
+            rising, last, seen = higher, grey, seen + 1
+            root_sum += signed_root(step.values, n_d)
+            if step.index in wanted:
+                kept[step.index] = step.values.clone()
     if not seen:
         raise SweepError(f"{name_of(stream.sweep)}: no frame to show")
     if lacking := set(frames) - set(kept):

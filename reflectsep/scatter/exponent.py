@@ -22,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reflectsep.scatter.frames import signed_root
+from reflectsep.scatter.local import quantile
 
 GRID = tuple(2.0 ** (i / 4) for i in range(-6, 7))
 """Exponents for which the roots are summed; between them logarithms are interpolated."""
@@ -93,13 +94,13 @@ def solve_exponent(samples: list[Samples], exponents: tuple[float, ...]) -> Expo
     )
 
 
-def complete(total: Tensor, full: Tensor, quantile: float = 0.75) -> Tensor:
+def complete(total: Tensor, full: Tensor, part: float = 0.75) -> Tensor:
     """Whether a sweep's sum holds all the light of the full picture: the slab reached all that feeds a pixel.
 
     A shadowed pixel passes too: the light in it came through the body, from where the slab did pass.
     """
     ratio = total / full
-    return ratio > 0.7 * ratio.quantile(quantile)
+    return ratio > 0.7 * quantile(ratio, part)
 
 
 def _binned(samples: Samples, exponents: tuple[float, ...], n_d: float) -> _Bins:

@@ -7,7 +7,7 @@ pixels far from the lit band, where profiles are smooth, and must treat it as a 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from reflectsep.data import Frame, FrameStream, Sweep
 from reflectsep.errors import SweepError
+from reflectsep.io.ahead import frames_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,14 +25,15 @@ class Step:
 
     index: int
     values: Float[Tensor, "channels height width"]
-    """Of the slab, linear, in the capture's units."""
-    saturated: Bool[Tensor, "channels height width"]
+    """Of the slab, linear, in the capture's units; off the object whatever the camera saw there, but finite."""
+    saturated: Bool[Tensor, "channels height width"] | None
+    """None: nothing is."""
     lost: bool = False
 
 
 def signed_root(values: Tensor, n_d: float) -> Tensor:
     """sign(I) |I|^(1/n_d): noise around zero stays around zero in a sum over frames."""
-    return values if n_d == 1.0 else values.sign() * values.abs().pow(1.0 / n_d)
+    return values if n_d == 1.0 else values.abs().pow_(1.0 / n_d).copysign_(values)
 
 
 def name_of(sweep: Sweep) -> str:
@@ -42,21 +44,24 @@ def name_of(sweep: Sweep) -> str:
 
 def steps(
     stream: FrameStream, full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"]
-) -> Iterator[Step]:
+) -> Generator[Step, None, None]:
     """Every step between the first and the last received frame, in order; two frames are held at a time.
+
+    Left half-way, it is to be closed (`contextlib.closing`), so that no thread goes on reading.
 
     Raises:
         SweepError: a frame of the wrong size, out of order, or with values that are no numbers.
     """
     before: Step | None = None
-    for frame in stream:
-        step = _checked(frame, stream.sweep, full, mask)
-        if before is not None:
-            if step.index <= before.index:
-                raise SweepError(f"{name_of(stream.sweep)}: frame {step.index} follows frame {before.index}")
-            yield from _between(before, step)
-        yield step
-        before = step
+    with frames_of(stream) as frames:
+        for frame in frames:
+            step = _checked(frame, stream.sweep, full, mask)
+            if before is not None:
+                if step.index <= before.index:
+                    raise SweepError(f"{name_of(stream.sweep)}: frame {step.index} follows frame {before.index}")
+                yield from _between(before, step)
+            yield step
+            before = step
 
 
 def _checked(frame: Frame, sweep: Sweep, full: Tensor, mask: Tensor) -> Step:
@@ -69,21 +74,27 @@ def _checked(frame: Frame, sweep: Sweep, full: Tensor, mask: Tensor) -> Step:
     if sweep.kind == "shadow":
         values = full - values
     # One sum tells whether any value is no number; which ones is looked for only then.
-    bad = ~torch.isfinite(values) & mask if not bool(torch.isfinite(values.sum())) else None
-    if bad is not None and bad.any():
-        raise SweepError(
-            f"{name_of(sweep)}, frame {frame.index}: {int(bad.sum())} values on the object are no finite numbers"
-        )
-    saturated = torch.zeros_like(values, dtype=torch.bool) if frame.saturated is None else frame.saturated
-    return Step(index=frame.index, values=torch.where(mask, values, 0.0), saturated=saturated & mask)
+    if not bool(torch.isfinite(values.sum())):
+        bad = ~torch.isfinite(values) & mask
+        if bad.any():
+            raise SweepError(
+                f"{name_of(sweep)}, frame {frame.index}: {int(bad.sum())} values on the object are no finite numbers"
+            )
+        values = torch.where(mask, values, 0.0)
+    clipped = None if frame.saturated is None or not frame.saturated.any() else frame.saturated & mask
+    return Step(index=frame.index, values=values, saturated=clipped)
 
 
 def _between(before: Step, after: Step) -> Iterator[Step]:
     gap = after.index - before.index
     for i in range(1, gap):
         values = _interpolated(before.values, after.values, i / gap)
-        clipped = before.saturated | after.saturated
+        clipped = _either(before.saturated, after.saturated)
         yield Step(index=before.index + i, values=values, saturated=clipped, lost=True)
+
+
+def _either(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    return b if a is None else a if b is None else a | b
 
 
 def _interpolated(a: Tensor, b: Tensor, weight: float) -> Tensor:

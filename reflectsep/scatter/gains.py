@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.filters import box_blur
 from torch import Tensor
 
 from reflectsep.data import PhotometricStack
 from reflectsep.scatter.exponent import GRID, UNKNOWN_SD, Exponent, Samples, complete, solve_exponent
 from reflectsep.scatter.frames import name_of
+from reflectsep.scatter.local import box_sum
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage
 from reflectsep.scatter.width import lit_frames
@@ -40,19 +41,24 @@ def exponents(options: ScatterOptions) -> tuple[float, ...]:
     return GRID if options.n_d is None else (options.n_d,)
 
 
-def choose_samples(stack: PhotometricStack, light: int) -> Bool[Tensor, "channels height width"]:
-    """Values of a light's full picture for Eq. 25: on the object, bright enough, unclipped, without a highlight.
+def choose_samples(stack: PhotometricStack, lights: Sequence[int]) -> list[Bool[Tensor, "channels height width"]]:
+    """Values of each light's full picture for Eq. 25: on the object, bright enough, unclipped, without a highlight.
 
     A pixel is chosen by its neighbours, never by its own noise: leaving out the brightest would bend Eq. 25.
     """
     near = torch.stack([_around(picture, stack.mask) for picture in stack.images])
-    own, typical = near[light], near.median(0).values
+    typical = near.median(0).values
+    chosen = {k: _chosen(stack, k, near[k], typical) for k in set(lights)}
+    return [chosen[k] for k in lights]
+
+
+def _chosen(stack: PhotometricStack, light: int, own: Tensor, typical: Tensor) -> Bool[Tensor, "channels height width"]:
     level = own.mean(0)
-    bright = (own > 0.05 * _quantile(level[stack.mask], 0.99)) & stack.mask & ~stack.saturated[light]
+    bright = (own > 0.05 * _rank(level[stack.mask], 0.99)) & stack.mask & ~stack.saturated[light]
     if not bright.any():
         return bright
     excess = own / typical.clamp(min=1e-6)
-    quiet = bright & (excess <= _quantile(excess[bright], HIGHLIGHT_RANK)) & (own <= _quantile(own[bright], 0.97))
+    quiet = bright & (excess <= _rank(excess[bright], HIGHLIGHT_RANK)) & (own <= _rank(own[bright], 0.97))
     where = quiet.flatten().nonzero()[:, 0]
     stride = max(1, -(-len(where) // MOST_SAMPLES))
     chosen = torch.zeros(own.numel(), dtype=torch.bool)
@@ -60,10 +66,9 @@ def choose_samples(stack: PhotometricStack, light: int) -> Bool[Tensor, "channel
     return chosen.view_as(own)
 
 
-def _quantile(values: Tensor, q: float) -> Tensor:
-    """As torch's, for any number of values."""
-    ordered = values.flatten().sort().values
-    return ordered[min(len(ordered) - 1, int(q * len(ordered)))]
+def _rank(values: Tensor, q: float) -> Tensor:
+    """The value below which a part q of all lies."""
+    return values.kthvalue(min(len(values), int(q * len(values)) + 1)).values
 
 
 def solve_gains(
@@ -152,8 +157,8 @@ def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tens
 def _around(full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"]) -> Tensor:
     """Mean over the 5 x 5 neighbours on the object, the pixel itself left out."""
     weight = mask.to(full)
-    values = box_blur((full * weight)[None], 5, border_type="constant")[0] * 25 - full * weight
-    count = box_blur(weight[None, None], 5, border_type="constant")[0] * 25 - weight
+    values = box_sum(full * weight) - full * weight
+    count = box_sum(weight[None]) - weight
     return torch.where(count > 0.5, values / count.clamp(min=0.5), full)
 
 

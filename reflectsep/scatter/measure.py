@@ -13,20 +13,22 @@ from typing import cast
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.filters import box_blur
 from torch import Tensor
 
 from reflectsep.data import FrameStream, PhotometricStack, Scattering, SweepReport
 from reflectsep.errors import SweepError
 from reflectsep.flags import Flag, mark
+from reflectsep.io.ahead import one_thread
 from reflectsep.progress import Progress, silent
-from reflectsep.scatter.band import Evidence, LitBand
+from reflectsep.scatter.band import LitBand
+from reflectsep.scatter.evidence import Evidence
 from reflectsep.scatter.exponent import complete
 from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
 from reflectsep.scatter.gains import Gains, choose_samples, exponents, solve_gains
 from reflectsep.scatter.geometry import crude_normals, surface_stretch
 from reflectsep.scatter.kernel import Slab
+from reflectsep.scatter.local import box_sum, quantile
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage, speed_deviation, watch
 
@@ -78,7 +80,18 @@ def measure_scattering(
     """
     options = options or ScatterOptions()
     lights = _lights(stack, sweeps)
-    chosen = [choose_samples(stack, k) for k in lights]
+    with one_thread():
+        return _measured(stack, sweeps, lights, options, progress)
+
+
+def _measured(
+    stack: PhotometricStack,
+    sweeps: Sequence[FrameStream],
+    lights: list[int],
+    options: ScatterOptions,
+    progress: Progress,
+) -> Scattering:
+    chosen = choose_samples(stack, lights)
     grid = torch.tensor(exponents(options), dtype=torch.float64)
     passages = [
         watch(stream, stack.images[k], stack.mask, exponents=grid, samples=c, progress=progress)
@@ -218,20 +231,18 @@ def _slab(lit_frames: float, step_px: float) -> Slab:
 def _coverage(full: Tensor, passage: Passage, mask: Tensor) -> tuple[Tensor, float]:
     """Pixels whose light the sweep holds whole, and their part of those bright enough to tell."""
     grey, total = full.mean(0), passage.total.mean(0)
-    ordered = grey[mask].sort().values
-    bright = mask & (grey > max(0.03 * float(ordered[int(0.99 * (len(ordered) - 1))]), 1e-9))
+    bright = mask & (grey > max(0.03 * float(quantile(grey[mask], 0.99)), 1e-9))
     if not bright.any():
         return mask.clone(), 1.0
     reached = mask.clone()
     usable = bright & ~passage.clipped & ~passage.lost_near()
     if usable.any():
         # Means over neighbours: a faint pixel's noise says nothing about the sweep.
-        near = box_blur(torch.stack([total, grey])[None] * usable, 5, border_type="constant")[0]
+        near = box_sum(torch.stack([total, grey]) * usable)
         reached[usable] = complete(near[0][usable], near[1][usable])
     # Where the slab speeds up sums are smaller, but what it lit itself, not just before it stopped, it has passed.
-    peaks = passage.peak[bright].sort().values
     inside = (passage.centre > passage.first + 1) & (passage.centre < passage.last - 1)
-    reached |= bright & inside & (passage.peak > 0.5 * peaks[int(0.95 * (len(peaks) - 1))])
+    reached |= bright & inside & (passage.peak > 0.5 * quantile(passage.peak[bright], 0.95))
     return reached, float(reached[bright].float().mean())
 
 

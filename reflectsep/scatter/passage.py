@@ -5,26 +5,36 @@ clamped at 0), a pixel's passage is the centroid of q^4 over the frames, which t
 of frames in which it is lit is the participation ratio (sum q^4)^2 / sum q^8. A centroid comes in steps of half a
 frame; passage is smooth over the picture, so a local plane through the centroids (Gaussian weights) places it to a
 small fraction of a frame, except where depth jumps: there the centroid itself stays.
+
+The sums over the frames are single precision: their rounding moves a centroid by 1e-7 of the frames' number. They are
+bound by memory, so that a tile of the picture is worked on for several frames while it is in the cache.
 """
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d
 
 from reflectsep.data import FrameStream, Sweep
 from reflectsep.errors import SweepError
+from reflectsep.io.ahead import one_thread
 from reflectsep.progress import Progress
 from reflectsep.scatter.frames import Step, name_of, steps
+from reflectsep.scatter.local import quantile
 from reflectsep.scatter.width import Keeper, Kept
 
 MIN_FRAMES = 5
-CACHED = 1 << 15
-"""Pixels at a time."""
+CACHED = 1 << 14
+"""Pixels of a tile."""
+TOGETHER, TOGETHER_BYTES = 4, 128 * 2**20
+"""Frames worked on at a time, and their bytes at most."""
+LEAST_Q, MOST_Q = 1e-4, 1e4
+"""Limits of q in the sums, whose eighth powers are floats; what is below counts for nothing in a fourth power."""
 SMOOTHING_PX = 2.0
 BROAD = 2.0
 """A profile so many times wider than the typical one is no passage of the slab."""
@@ -98,29 +108,72 @@ def watch(
         SweepError: fewer than 5 frames, or a frame that cannot be used.
     """
     grey = full.mean(0)
-    floor = 0.01 * float(grey[mask].abs().quantile(0.99)) if mask.any() else 1.0
+    floor = 0.01 * float(quantile(grey[mask].abs(), 0.99)) if mask.any() else 1.0
     scale = grey.clamp(min=max(floor, 1e-12))
-    sums, keeper = _Sums(full, scale, exponents, samples), Keeper(mask)
+    sums, keeper = _Sums(full, mask, scale, exponents, samples), Keeper(mask)
     received = 0
-    for step in steps(stream, full, mask):
-        sums.add(step)
-        keeper.add(step)
-        received += not step.lost
-        progress(f"sweep {stream.sweep.light} {stream.sweep.direction}: passage", step.index + 1, len(stream))
+    with one_thread(), closing(steps(stream, full, mask)) as walked:
+        for step in walked:
+            sums.add(step)
+            keeper.add(step)
+            received += not step.lost
+            progress(f"sweep {stream.sweep.light} {stream.sweep.direction}: passage", step.index + 1, len(stream))
     if received < MIN_FRAMES:
         raise SweepError(f"{name_of(stream.sweep)}: {received} frames, expected at least {MIN_FRAMES}")
-    return sums.passage(stream.sweep, mask, received, keeper.kept())
+    return sums.passage(stream.sweep, received, keeper.kept())
+
+
+def tiles(mask: Bool[Tensor, "height width"], pixels: int) -> list[tuple[slice, slice]]:
+    """Rows and columns of strips of about so many pixels that cover the object, and little else."""
+    found = []
+    height, width = mask.shape
+    lines = max(1, pixels // width)
+    for top in range(0, height, lines):
+        rows = slice(top, min(height, top + lines))
+        columns = mask[rows].any(0).nonzero()[:, 0]
+        if len(columns):
+            found.append((rows, slice(int(columns[0]), int(columns[-1]) + 1)))
+    return found
+
+
+class _Tile:
+    """Running sums of a part of the picture."""
+
+    def __init__(self, place: tuple[slice, slice], maps: tuple[Tensor, ...], total: Tensor) -> None:
+        self.place = place
+        self.scale, self.q4, self.q8, self.q4t, self.peak = (each[place] for each in maps)
+        self.total = total[(slice(None), *place)]
+
+    def add(self, steps_: list[Step], scratch: Tensor) -> None:
+        q = scratch[: self.scale.numel()].view(self.scale.shape)
+        for step in steps_:
+            values = step.values[(slice(None), *self.place)]
+            self.total += values
+            if step.lost:
+                continue
+            torch.mul(values[0] if len(values) == 1 else values.sum(0), self.scale, out=q)
+            q.clamp_(LEAST_Q, MOST_Q)
+            torch.maximum(self.peak, q, out=self.peak)
+            q4 = q.square_().square_()
+            self.q4 += q4
+            self.q4t.add_(q4, alpha=step.index)
+            self.q8.addcmul_(q4, q4)
 
 
 class _Sums:
     """Running sums over the frames; their size is that of a few pictures."""
 
-    def __init__(self, full: Tensor, scale: Tensor, exponents: Tensor, samples: Tensor) -> None:
-        self.scale, self.exponents, self.where = scale, exponents, samples.flatten().nonzero()[:, 0]
-        zero = torch.zeros_like(scale, dtype=torch.float64)
-        self.q4, self.q8, self.q4t, self.peak = zero, zero.clone(), zero.clone(), torch.zeros_like(scale)
+    def __init__(self, full: Tensor, mask: Tensor, scale: Tensor, exponents: Tensor, samples: Tensor) -> None:
+        self.mask = mask
+        self.powers, self.where = 1.0 / exponents.to(full), samples.flatten().nonzero()[:, 0]
+        self.q4, self.q8, self.q4t, self.peak = (torch.zeros_like(scale) for _ in range(4))
         self.total = torch.zeros_like(full)
-        self.clipped = torch.zeros_like(scale, dtype=torch.bool)
+        maps = (1.0 / (len(full) * scale), self.q4, self.q8, self.q4t, self.peak)
+        self.tiles = [_Tile(place, maps, self.total) for place in tiles(mask, CACHED)]
+        self.scratch = torch.empty(max((tile.scale.numel() for tile in self.tiles), default=0), dtype=full.dtype)
+        self.together = max(1, min(TOGETHER, TOGETHER_BYTES // (full.numel() * full.element_size())))
+        self.waiting: list[Step] = []
+        self.clipped = torch.zeros_like(mask)
         self.sums = torch.zeros((len(exponents), len(self.where)), dtype=torch.float64)
         self.lost: list[int] = []
         self.indices: list[int] = []
@@ -131,28 +184,21 @@ class _Sums:
         self.indices.append(step.index)
         if step.lost:
             self.lost.append(step.index)
-        else:
-            self._watch(step)
-        self.total += step.values
-        self.clipped |= step.saturated.any(0)
-        chosen = step.values.flatten()[self.where].double()
+        self.waiting.append(step)
+        if len(self.waiting) == self.together:
+            self._add_waiting()
+        if step.saturated is not None:
+            self.clipped |= step.saturated.any(0)
+        chosen = step.values.flatten()[self.where]
         # All roots from one logarithm: a power costs ten times what an exponential does.
         logs = chosen.abs().clamp_min(torch.finfo(chosen.dtype).tiny).log()
-        self.sums += (logs / self.exponents[:, None]).exp_() * chosen.sign()
+        self.sums += (logs * self.powers[:, None]).exp_() * chosen.sign()
         self._take_noise(chosen, step.lost)
 
-    def _watch(self, step: Step) -> None:
-        """Sums of q^4 and its like, some lines at a time: what stays in the cache is several times as fast."""
-        values, lines = step.values, max(1, CACHED // self.scale.shape[1])
-        for start in range(0, len(self.scale), lines):
-            cut = slice(start, start + lines)
-            grey = values[0, cut] if len(values) == 1 else values[:, cut].mean(0)
-            q = (grey / self.scale[cut]).clamp_(min=0.0)
-            torch.maximum(self.peak[cut], q, out=self.peak[cut])
-            q4 = q.double().square_().square_()
-            self.q4[cut] += q4
-            self.q8[cut].addcmul_(q4, q4)
-            self.q4t[cut].add_(q4, alpha=step.index)
+    def _add_waiting(self) -> None:
+        for tile in self.tiles:
+            tile.add(self.waiting, self.scratch)
+        self.waiting = []
 
     def _take_noise(self, values: Tensor, lost: bool) -> None:
         """Second difference along time; its median size over the samples is noise, where most of them are dark."""
@@ -161,10 +207,12 @@ class _Sums:
             a, b, c = self.recent
             self.noises.append(float(1.4826 * (a - 2 * b + c).abs().median() / 6**0.5))
 
-    def passage(self, sweep: Sweep, mask: Tensor, received: int, kept: Kept) -> Passage:
-        centroid = (self.q4t / self.q4.clamp(min=1e-30)).to(self.scale.dtype)
-        lit = (self.q4**2 / self.q8.clamp(min=1e-60)).to(self.scale.dtype)
-        centre = _smooth(centroid, _trust(lit, self.peak, mask))
+    def passage(self, sweep: Sweep, received: int, kept: Kept) -> Passage:
+        self._add_waiting()
+        mask, peak = self.mask, torch.where(self.mask & (self.peak > LEAST_Q), self.peak, 0.0)
+        centroid = self.q4t / self.q4.clamp(min=1e-30)
+        lit = self.q4 / self.q8.clamp(min=1e-37) * self.q4
+        centre = _smooth(centroid, _trust(lit, peak, mask), mask)
         width = float(lit[mask].median())
         lost_away = torch.full_like(centre, torch.inf)
         for index in self.lost:
@@ -172,10 +220,10 @@ class _Sums:
         return Passage(
             sweep=sweep,
             centre=centre,
-            peak=self.peak,
+            peak=peak,
             lit_frames=lit,
             narrow=(lit < BROAD * width) & ((centroid - centre).abs() <= JUMP_FRAMES),
-            total=self.total,
+            total=self.total * mask,
             clipped=self.clipped,
             first=self.indices[0],
             last=self.indices[-1],
@@ -194,14 +242,15 @@ def _trust(lit: Tensor, peak: Tensor, mask: Tensor) -> Tensor:
     return narrow * (peak / typical.clamp(min=1e-12)).clamp(max=1.0) ** 4
 
 
-def _smooth(centroid: Tensor, weight: Tensor) -> Tensor:
+def _smooth(centroid: Tensor, weight: Tensor, mask: Tensor) -> Tensor:
     """Local plane through the centroids; Gaussian weights; wider where few pixels are trusted."""
-    height, width = centroid.shape
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     result = centroid
-    weak = weight < WEAK
+    # A little beyond the object too, since slopes are taken at its rim.
+    weak = (weight < WEAK) & (max_pool2d(mask[None, None].float(), 3, stride=1, padding=1)[0, 0] > 0)
     for sigma in (SMOOTHING_PX, 4 * SMOOTHING_PX):
-        plane, mass = _local_plane(centroid, weight, x.to(centroid), y.to(centroid), sigma)
+        if sigma > SMOOTHING_PX and not weak.any():
+            break
+        plane, mass = _local_plane(centroid, weight, sigma)
         near = (plane - centroid).abs() <= JUMP_FRAMES
         use = (mass > 0.05) & (weak | (near & (sigma == SMOOTHING_PX)))
         result = torch.where(use, plane, result)
@@ -209,27 +258,50 @@ def _smooth(centroid: Tensor, weight: Tensor) -> Tensor:
     return result
 
 
-def _local_plane(centroid: Tensor, weight: Tensor, x: Tensor, y: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    radius = min(int(3 * sigma), min(centroid.shape) - 1)
-    size = 2 * radius + 1
-
-    def blur(image: Tensor) -> Tensor:
-        return gaussian_blur2d(image.double()[None, None], (size, size), (sigma, sigma), border_type="constant")[0, 0]
-
+def _local_plane(centroid: Tensor, weight: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
+    """At every pixel the plane through the weighted centroids around it, and their weight."""
+    height, width = centroid.shape
+    radius = min(int(3 * sigma), min(height, width) - 1)
     offset = centroid[weight > 0].mean() if (weight > 0).any() else centroid.mean()
-    columns = [torch.ones_like(x), x - x.mean(), y - y.mean()]
-    normal = torch.stack([torch.stack([blur(weight * a * b) for b in columns], -1) for a in columns], -2)
-    right = torch.stack([blur(weight * a * (centroid - offset)) for a in columns], -1)
+    moved = weight * (centroid - offset)
+    plane, mass = torch.empty_like(centroid), torch.empty_like(centroid)
+    lines = max(8 * radius, (1 << 18) // width)
+    for top in range(0, height, lines):
+        bottom = min(height, top + lines)
+        halo = slice(max(0, top - radius), min(height, bottom + radius))
+        own = slice(top - halo.start, bottom - halo.start)
+        plane[top:bottom], mass[top:bottom] = _planes(weight[halo], moved[halo], own, sigma, radius)
+    return plane + offset, mass
+
+
+def _planes(weight: Tensor, moved: Tensor, own: slice, sigma: float, radius: int) -> tuple[Tensor, Tensor]:
+    """Height of the local planes at the pixels of the rows `own`, by moments about each pixel itself."""
+    away = torch.arange(-radius, radius + 1, dtype=weight.dtype)
+    bell = torch.exp(-0.5 * (away / sigma) ** 2)
+    bell = bell / bell.sum()
+    kernels = torch.stack([bell, bell * away, bell * away**2])[:, None]
+
+    def along_x(picture: Tensor, powers: int) -> Tensor:
+        return conv2d(picture[None, None], kernels[:powers, :, None, :], padding=(0, radius))[0]
+
+    def along_y(picture: Tensor, powers: int) -> Tensor:
+        return conv2d(picture[None, None], kernels[:powers, :, :, None], padding=(radius, 0))[0][:, own].double()
+
+    w = along_x(weight, 3)
+    (m, m_y, m_yy), (m_x, m_xy), (m_xx,) = (along_y(w[i], 3 - i) for i in range(3))
+    w = along_x(moved, 2)
+    (r, r_y), (r_x,) = (along_y(w[i], 2 - i) for i in range(2))
     # A trace of ridge: where all weight lies on one line the plane is level across it.
-    ridge = 1e-6 * torch.eye(3, dtype=torch.float64)
-    ridge[0, 0] = 1e-12
-    coefficients = torch.linalg.solve(normal + ridge, right)
-    plane = (coefficients * torch.stack(columns, -1)).sum(-1) + offset
-    return plane.to(centroid.dtype), normal[..., 0, 0]
+    ridge = 1e-5 * sigma**2
+    m_xx, m_yy = m_xx + ridge, m_yy + ridge
+    determinant = m_xx * m_yy - m_xy**2
+    x, y = (m_yy * m_x - m_xy * m_y) / determinant, (m_xx * m_y - m_xy * m_x) / determinant
+    height = (r - x * r_x - y * r_y) / (m + 1e-12 - x * m_x - y * m_y)
+    return height.to(weight.dtype), m.to(weight.dtype)
 
 
 def _eroded(mask: Tensor) -> Tensor:
-    inner = torch.nn.functional.max_pool2d((~mask)[None, None].float(), 5, stride=1, padding=2)[0, 0] == 0
+    inner = max_pool2d((~mask)[None, None].float(), 5, stride=1, padding=2)[0, 0] == 0
     return inner & mask
 
 
@@ -244,9 +316,11 @@ def speed_deviation(
     grey, total = full.mean(0), passage.total.mean(0)
     sound = mask & ~passage.clipped & ~passage.lost_near()
     sound &= grey > 0.05 * grey[mask].max()
-    frame = passage.centre.round().long()
-    ratios = [(total / grey)[sound & (frame == i)] for i in range(passage.first, passage.last + 1)]
-    medians = torch.tensor([float(r.median()) for r in ratios if len(r) >= 4])
+    frame, ratio = passage.centre[sound].round().long(), (total / grey)[sound]
+    within = (frame >= passage.first) & (frame <= passage.last)
+    order = frame[within].argsort(stable=True)
+    groups = ratio[within][order].split(frame[within].bincount().tolist())
+    medians = torch.tensor([float(r.median()) for r in groups if len(r) >= 4])
     if len(medians) < 3:
         return 0.0
     middle = medians.median()

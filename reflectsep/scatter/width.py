@@ -60,8 +60,10 @@ class Keeper:
         """One frame."""
         self._index.append(step.index)
         self._value.append(step.values.flatten(1)[:, self.at].mean(0))
-        clipped = step.saturated.flatten(1)[:, self.at].any(0)
-        self._spoilt.append(torch.ones_like(clipped) if step.lost else clipped)
+        spoilt = torch.full((len(self.at),), step.lost)
+        if step.saturated is not None:
+            spoilt |= step.saturated.flatten(1)[:, self.at].any(0)
+        self._spoilt.append(spoilt)
 
     def kept(self) -> Kept:
         """What was taken."""

@@ -6,9 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reflectsep.calibrate.develop import develop
 from reflectsep.calibrate.exposure import (
     colour_of,
-    develop,
     developed_stream,
     exposure_ratio,
     gamma_response,

@@ -5,11 +5,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reflectsep.scatter.band import Profiles
 from reflectsep.scatter.exponent import GRID, Samples, solve_exponent
 from reflectsep.scatter.filling import fill_along_time, fill_by_interpolation, fill_by_maximum
 from reflectsep.scatter.frames import signed_root, steps
-from reflectsep.scatter.kernel import Slab, beyond, fill_by_profile, line_response, nonnegative_least_squares
+from reflectsep.scatter.kernel import Slab, beyond, fill_by_profile, line_response
+from reflectsep.scatter.windows import Profiles
+from reflectsep.solve.nonnegative import nonnegative_least_squares
 
 
 @given(st.floats(1e-6, 4).flatmap(lambda v: st.sampled_from([v, -v, 0.0])), st.floats(0.3, 3))
@@ -48,7 +49,7 @@ def test_nonnegative_least_squares_is_optimal():
     a = torch.rand(12, 4, 50, dtype=torch.float64)
     y = torch.rand(12, 50, dtype=torch.float64) - 0.2
     normal, right = torch.einsum("fip,fjp->ijp", a, a), torch.einsum("fip,fp->ip", a, y)
-    x = nonnegative_least_squares(normal, right, passes=2000)
+    x = nonnegative_least_squares(normal, right)
     gradient = torch.einsum("ijp,jp->ip", normal, x) - right
     assert (x >= 0).all()
     # Karush-Kuhn-Tucker: no slope where free, none downhill where held.
@@ -65,7 +66,7 @@ def profiles(root, u, half):
         hole=hole,
         lit=hole.any(0),
         light=torch.ones_like(u),
-        rest=torch.zeros(1, u.shape[1]),
+        at=torch.arange(u.shape[1]),
         **flat,
     )
 
@@ -81,7 +82,7 @@ def test_profile_recovers_its_own_model():
     p = profiles(root, u, slab.half + slab.edge)
     far = beyond(0.5, s).repeat(2)
     expected = 2 * slab.half * (amplitude * far).sum()
-    total = p.measured + fill_by_profile(p, slab, distance_px=1.0, noise=0.0)
+    total = p.root.sum(0) - p.unsound + fill_by_profile(p, slab, distance_px=1.0, noise=0.0)
     assert torch.allclose(total, expected.expand_as(total), rtol=0.06)
 
 
