@@ -1,11 +1,13 @@
 import importlib.util
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from reflectsep.errors import CaptureError, MissingExtraError
+from reflectsep.io.ahead import NO_LEAD, Lead
 from reflectsep.io.capture import load_capture, write_manifest
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.pictures import write_picture
@@ -30,16 +32,18 @@ def test_frames_as_often_as_wanted(tiny):
             assert not frame.saturated.any()
 
 
-def test_one_frame_at_a_time(tiny, monkeypatch):
+@pytest.mark.parametrize(("lead", "most"), [(NO_LEAD, 1), (Lead(threads=1, held=1), 2)])
+def test_no_more_frames_than_asked_for(tiny, monkeypatch, lead, most):
     read = []
     from reflectsep.io import frames
 
     real = frames.read_picture
     monkeypatch.setattr(frames, "read_picture", lambda path, *rest: read.append(path.name) or real(path, *rest))
-    iterator = iter(opened(tiny))
+    iterator = iter(replace(opened(tiny), lead=lead))
     read.clear()
     next(iterator)
-    assert read == ["0000.exr"]
+    assert 1 <= len(read) <= most
+    assert read == ["0000.exr", "0001.exr"][: len(read)]
 
 
 def test_lost_frames_are_left_out(tiny):
