@@ -29,7 +29,7 @@ BYTES_A_VALUE = 5
 def open_sweep(capture: Capture, sweep: Sweep) -> FrameStream:
     """A stream of the frames of `sweep`, values as stored (0 to 1 of integers), clipped ones marked.
 
-    It can be gone through any number of times and holds one frame at a time.
+    It can be gone through any number of times, and holds few frames at a time (`io/ahead.py`).
 
     Args:
         capture: whose sweep it is; the first basis picture is read, for the number of channels.
