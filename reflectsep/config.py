@@ -274,7 +274,9 @@ class FitJob:
     heldout: list[str] | None = setting(None, "names of lights to leave out of the fit")
     lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
     report: bool = setting(True, "write report.html beside the result")
-    baseline: bool = setting(False, "fit Lin & Lee's model as well, to stand beside in the report; takes as long again")
+    baseline: bool | None = setting(
+        None, "fit Lin & Lee's model as well, to stand beside in the report; null: where that takes a minute at most"
+    )
 
     def __post_init__(self) -> None:
         check(self)

@@ -48,6 +48,7 @@ from reflectsep.config import (
 )
 from reflectsep.data import Capture, Light, PhotometricStack, Scattering
 from reflectsep.errors import FitError, LightError, ReflectsepError, ResultError, SettingsError, SweepError
+from reflectsep.estimate import Part
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
 from reflectsep.io import calibration as calibration_file
@@ -57,7 +58,7 @@ from reflectsep.io.frames import open_sweep
 from reflectsep.io.lights import read_lights
 from reflectsep.io.pictures import read_picture
 from reflectsep.io.stack import read_full, read_mask
-from reflectsep.progress import Journal, Progress, expect, silent
+from reflectsep.progress import Journal, Progress, Titled, expect, silent, titled
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
 from reflectsep.report.figures import HeldOut
 from reflectsep.report.sheet import motion_plot
@@ -243,6 +244,11 @@ def fit_options(settings: FitSettings) -> FitOptions:
     return FitOptions(**dataclasses.asdict(settings))
 
 
+LIN_LEE = "Lin & Lee beside"
+QUICK_S = 60.0
+"""Lin & Lee's model is fitted unasked where it is expected to take no longer."""
+
+
 class Clock:
     """Seconds spent in each stage."""
 
@@ -310,7 +316,8 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )
-    journal = Journal(progress, after=reporting(counts_before(capture), len(capture.sweeps)) if job.report else ())
+    compared = wants_baseline(job, capture)
+    journal = Journal(progress, after=parts_after(job, capture, compared))
     separation = fit(
         capture,
         settings=job.fit,
@@ -327,8 +334,8 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
         separation.save(job.out, overwrite=job.overwrite, previews=previews(separation))
     said = f"{job.out}: {summary(separation)}"
     baseline = None
-    if job.report and job.baseline and bool(separation.s.any()):
-        baseline = lin_lee_beside(separation, capture, job.fit, journal)
+    if compared and bool(separation.s.any()):
+        baseline = lin_lee_beside(separation, capture, job.fit, Titled(journal, LIN_LEE))
     if not first:
         return said
     if job.report:
@@ -339,6 +346,29 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
     log = f"{datetime.now(UTC).isoformat(timespec='seconds')} fit of {job.capture}\n{journal.text()}"
     atomic_write(Path(job.out) / "log.txt", lambda path: path.write_text(log, encoding="utf-8"))
     return said
+
+
+def wants_baseline(job: FitJob, capture: Capture) -> bool:
+    """Whether Lin & Lee's model is to be fitted as well: where that is said, or quick."""
+    swept = bool(capture.sweeps) and job.fit.scattering == "measured"
+    if not job.report or not swept or job.baseline is not None:
+        return job.report and bool(job.baseline)
+    return sum(part.expected_s for part in baseline_parts(job, capture)) <= QUICK_S
+
+
+def baseline_parts(job: FitJob, capture: Capture) -> list[Part]:
+    """Parts of the fit of Lin & Lee's model."""
+    counts, aligned = counts_before(capture), job.calibration.registration != "none"
+    without_s = fit_options(dataclasses.replace(job.fit, scattering="none"))
+    return [*reading(capture, counts, aligned=aligned, swept=False), *solving(counts, without_s, swept=False)]
+
+
+def parts_after(job: FitJob, capture: Capture, compared: bool) -> list[Part]:
+    """What follows a fit: Lin & Lee's, and the report."""
+    if not job.report:
+        return []
+    baseline = titled(baseline_parts(job, capture), LIN_LEE) if compared else []
+    return [*baseline, *reporting(counts_before(capture), len(capture.sweeps))]
 
 
 def run_relight(job: RelightJob, progress: Progress = silent) -> str:

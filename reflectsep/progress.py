@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Protocol, TextIO, runtime_checkable
 
 from reflectsep.estimate import Part
@@ -101,6 +102,31 @@ class Journal:
         """One line a stage that has ended, `NAME: SECONDS s`, in their order."""
         self._stages.close()
         return self._lines.getvalue()
+
+
+class Titled:
+    """Hands on the stages of a run within another under a title; the other has announced them (`titled`).
+
+    Args:
+        progress: where they go.
+        title: stands before their names.
+    """
+
+    def __init__(self, progress: Progress, title: str) -> None:
+        self._progress = progress
+        self._title = title
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Hand a step on."""
+        self._progress(f"{self._title}: {stage}", done, total)
+
+    def expect(self, parts: Sequence[Part]) -> None:
+        """Nothing: what was announced before stays."""
+
+
+def titled(parts: Sequence[Part], title: str) -> list[Part]:
+    """Parts of a run within another, on one line of its stage list."""
+    return [replace(part, name=f"{title}: {part.name}", label=title) for part in parts]
 
 
 @contextmanager

@@ -101,6 +101,20 @@ def test_a_fit_leaves_a_report_unless_told_not_to(result, said):
     assert not re.search(r"https?://|<script|<link|@import|url\(", text)
 
 
+def test_the_report_has_lin_and_lee_beside_where_that_is_quick_or_asked_for(result, captured, monkeypatch):
+    job = FitJob(capture=str(captured), out=str(result) + "_again")
+    capture = reflectsep.load_capture(captured)
+    assert pipeline.wants_baseline(job, capture)
+    assert "Lin &amp; Lee" in (result / "report.html").read_text()
+    assert not pipeline.wants_baseline(dataclasses.replace(job, report=False), capture)
+    assert not pipeline.wants_baseline(dataclasses.replace(job, baseline=False), capture)
+    lin_lee = dataclasses.replace(job, fit=FitSettings(scattering="none"))
+    assert not pipeline.wants_baseline(lin_lee, capture)
+    monkeypatch.setattr(pipeline, "QUICK_S", 0.0)
+    assert not pipeline.wants_baseline(job, capture)
+    assert pipeline.wants_baseline(dataclasses.replace(job, baseline=True), capture)
+
+
 def test_document_says_how_it_came_about(result, captured):
     document = json.loads((result / "separation.json").read_text())
     assert document["capture"] == str(captured.resolve())

@@ -144,6 +144,25 @@ def test_an_announcement_goes_through_a_journal_with_what_follows():
     progress.expect(progress.silent, [a])  # who does not want to know is not told
 
 
+def test_a_run_within_a_run_goes_under_its_title():
+    handed, told = [], []
+
+    class Display:
+        def expect(self, parts):
+            told.append(parts)
+
+        def __call__(self, *step):
+            handed.append(step)
+
+    within = progress.Titled(Display(), "beside")
+    progress.expect(within, [Part(name="globals", label="globals", expected_s=1.0)])
+    within("globals", 1, 2)
+    assert handed == [("beside: globals", 1, 2)]
+    assert told == []  # what was announced before stays
+    (part,) = progress.titled([Part(name="globals", label="globals", expected_s=3.0)], "beside")
+    assert (part.name, part.label, part.expected_s) == ("beside: globals", "beside", 3.0)
+
+
 def test_parallel_runs_share_a_terminal_by_lines():
     stream = Terminal()
     with progress.shown("a: ", parallel=True, stream=stream) as show:
