@@ -10,9 +10,10 @@ import itertools
 import os
 import shutil
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 import torch
@@ -21,8 +22,10 @@ from torch import Tensor
 Part = TypeVar("Part")
 
 LEAST_PART = 1 << 14
+"""Pixels: one block of a compiled kernel."""
 WORTH_COMPILING = 1 << 18
 """Pixels below which compilation costs more than it saves."""
+_ONE_AT_A_TIME = threading.Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,23 +49,36 @@ class Speed:
         """
         return -(-(most if self.compiles(pixels, like) else min(most, pixels)) // 64) * 64
 
-    def parts(self, pixels: int) -> list[slice]:
-        """The pixels shared out to the cores; a part has `LEAST_PART` pixels at least."""
-        cores = torch.get_num_threads() if self.cores is None else self.cores
-        number = max(1, min(cores, pixels // LEAST_PART))
-        ends = [pixels * i // number for i in range(number + 1)]
-        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+    @property
+    def workers(self) -> int:
+        """Cores that there are."""
+        return torch.get_num_threads() if self.cores is None else self.cores
+
+    def parts(self, pixels: int, most: int | None = None) -> list[slice]:
+        """The pixels shared out to the cores, `LEAST_PART` at least and whole ones but for the last.
+
+        As many parts for every core; where `most` is given, so many that all cores together are at `most` pixels.
+        """
+        at_work = max(1, min(self.workers, pixels // LEAST_PART))
+        number = at_work * max(1, -(-pixels // most)) if most is not None else at_work
+        # Every begun block costs as much as a full one.
+        ends = [min(pixels, LEAST_PART * round(pixels * i / number / LEAST_PART)) for i in range(number)]
+        return [slice(a, b) for a, b in itertools.pairwise([*ends, pixels]) if a < b]
+
+    def of_a_part(self, pixels: int, like: Tensor) -> Speed:
+        """How one of the parts of so many pixels runs: on one core, compiled if the whole is worth it."""
+        return replace(self, compile="always" if self.compiles(pixels, like) else "never", cores=1)
 
 
-def side_by_side(work: Callable[[slice], Part], parts: Sequence[slice]) -> list[Part]:
-    """`work` on every part, each on a core of its own; results in the order of the parts."""
-    if len(parts) == 1:
-        return [work(parts[0])]
+def side_by_side(work: Callable[[slice], Part], parts: Sequence[slice], workers: int | None = None) -> list[Part]:
+    """`work` on every part, `workers` (all) of them at a time, each on one core; results in the order of the parts."""
     threads = torch.get_num_threads()
-    # Torch's own threads would fight over the cores that the parts are on.
+    # Torch's own threads would fight over the cores that the parts are on; and a kernel is compiled for their number.
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(len(parts)) as pool:
+        if len(parts) == 1:
+            return [work(parts[0])]
+        with ThreadPoolExecutor(min(len(parts), workers or len(parts))) as pool:
             return list(pool.map(work, parts))
     finally:
         torch.set_num_threads(threads)
@@ -81,13 +97,19 @@ def _bound(function: Callable[..., Any], form: tuple[Any, ...], *tensors: Tensor
     return function(*tensors, *form)
 
 
-@functools.cache
 def compiled(function: Callable[..., Any], form: tuple[Any, ...]) -> Callable[..., Any]:
-    """One compiled kernel for every form."""
+    """One compiled kernel for every form, whichever core asks first."""
+    with _ONE_AT_A_TIME:
+        return _compiled(function, form)
 
+
+@functools.cache
+def _compiled(function: Callable[..., Any], form: tuple[Any, ...]) -> Callable[..., Any]:
     def kernel(*tensors: Tensor) -> Any:
         return function(*tensors, *form)
 
+    # A code object of its own: torch counts the compilations of each, and gives up after eight.
+    kernel.__code__ = kernel.__code__.replace(co_name=function.__name__)
     # Everything is to become one loop; a block is one core's work, other cores take other pixels, for which the call
     # must let go of Python's lock: only the C++ wrapper does.
     options: dict[str, Any] = {"max_fusion_size": 1 << 14, "cpp.threads": 1, "cpp_wrapper": True}

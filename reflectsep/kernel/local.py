@@ -72,15 +72,16 @@ class Block:
 
     def put(self, slots: Tensor, problem: PixelProblem, queue: Queue, first: int) -> None:
         """Entries first, first + 1, ... of the queue into `slots`."""
-        cut = slice(first, first + len(slots))
-        pixels, at = cut if queue.which is None else queue.which[cut], 0
+        # By scatter_ and gather: advanced indexing takes four times as long.
+        cut, at = slice(first, first + len(slots)), 0
         for values in problem.maps:
-            self.maps[at : at + len(values), slots] = values[:, pixels]
+            new = values[:, cut] if queue.which is None else values.gather(1, queue.which[cut].expand(len(values), -1))
+            self.maps[at : at + len(values)].scatter_(1, slots.expand(len(values), -1), new)
             at += len(values)
-        self.state[PLACE, slots] = queue.start[:, cut]
         fresh = queue.start.new_tensor([float("inf"), 1.0, 0.0, float(ACTIVE)])
-        self.state[COST : STATUS + 1, slots] = fresh[:, None].expand(-1, len(slots))
-        self.entry[slots] = torch.arange(first, first + len(slots), device=slots.device)
+        state = torch.cat([queue.start[:, cut], fresh[:, None].expand(-1, len(slots))])
+        self.state[: STATUS + 1].scatter_(1, slots.expand(len(state), -1), state)
+        self.entry.scatter_(0, slots, torch.arange(first, first + len(slots), device=slots.device))
 
     def narrowed(self, slots: Tensor, size: int) -> Block:
         """A smaller block with only `slots`."""
@@ -170,9 +171,9 @@ def _solve_queue(
 
 def harvest(slots: Block, at: Tensor, local: Tensor, cost: Tensor, status: Tensor) -> int:
     """Write the results of slots `at` to their pixels and empty them; returns their iterations."""
-    entry = slots.entry[at]
-    local[:, entry] = slots.state[PLACE, at]
-    cost[entry] = slots.state[COST, at]
-    status[entry] = slots.state[STATUS, at].to(torch.int8)
-    slots.state[STATUS, at] = float(EMPTY)
-    return int(slots.state[COUNT, at].sum())
+    entry, state = slots.entry[at], slots.state[: STATUS + 1].gather(1, at.expand(STATUS + 1, -1))
+    local.scatter_(1, entry.expand(4, -1), state[PLACE])
+    cost.scatter_(0, entry, state[COST])
+    status.scatter_(0, entry, state[STATUS].to(torch.int8))
+    slots.state[STATUS].index_fill_(0, at, float(EMPTY))
+    return int(state[COUNT].sum())

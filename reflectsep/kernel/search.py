@@ -213,14 +213,17 @@ def search_pixels(
         status=torch.empty(len(problem), dtype=torch.int8, device=problem.images.device),
         iterations=0,
     )
-    total = 0
-    for first in range(0, len(problem), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
-        found, room = _search(problem.take(part), lobe, scan, speed), result.at(part)
+    own = speed.of_a_part(len(problem), problem.images)
+
+    def work(part: slice) -> int:
+        # From the scan to the choice on one core: the cores meet only at the end.
+        found, room = _search(problem.take(part), lobe, scan, own), result.at(part)
         room.local.copy_(found.local)
         room.cost.copy_(found.cost)
         room.status.copy_(found.status)
-        total += found.iterations
+        return found.iterations
+
+    total = sum(side_by_side(work, speed.parts(len(problem), AT_ONCE), speed.workers))
     return replace(result, iterations=total)
 
 

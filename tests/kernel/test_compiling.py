@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import threading
+import time
+
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from reflectsep.kernel import compiling
-from reflectsep.kernel.compiling import WORTH_COMPILING, Speed, side_by_side
+from reflectsep.kernel.compiling import LEAST_PART, WORTH_COMPILING, Speed, side_by_side
 from reflectsep.kernel.local import solve_pixels
 
 
@@ -34,11 +39,43 @@ def test_small_problems_are_never_compiled(monkeypatch):
     assert not Speed(compile="never").compiles(1 << 30, like)
 
 
-def test_parts_cover_the_pixels_once():
-    parts = Speed(cores=3).parts(100_000)
-    assert len(parts) == 3
-    assert [i for part in parts for i in (part.start, part.stop)] == [0, 33333, 33333, 66666, 66666, 100_000]
+@given(st.integers(1, 3_000_000), st.integers(1, 9), st.one_of(st.none(), st.integers(LEAST_PART, 1_000_000)))
+def test_parts_cover_the_pixels_once(pixels, cores, most):
+    parts = Speed(cores=cores).parts(pixels, most)
+    assert [0, *(part.stop for part in parts)] == [*(part.start for part in parts), pixels]
+    assert all(part.stop - part.start > 0 for part in parts)
+    assert all(part.start % LEAST_PART == 0 for part in parts)
+
+
+def test_every_core_gets_a_part_and_all_together_no_more_than_allowed():
+    assert Speed(cores=2).parts(100_000) == [slice(0, 3 * LEAST_PART), slice(3 * LEAST_PART, 100_000)]
     assert Speed(cores=8).parts(100) == [slice(0, 100)]
+    parts = Speed(cores=2).parts(40 * LEAST_PART, 10 * LEAST_PART)
+    assert {part.stop - part.start for part in parts} == {5 * LEAST_PART}
+
+
+def test_of_many_parts_no_more_than_there_are_workers_run_at_a_time():
+    running, most, lock = 0, 0, threading.Lock()
+
+    def work(part):
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        time.sleep(0.01)
+        with lock:
+            running -= 1
+        return part.start
+
+    assert side_by_side(work, [slice(i, i + 1) for i in range(8)], 2) == list(range(8))
+    assert most == 2
+
+
+def test_torch_counts_the_compilations_of_every_form_on_its_own():
+    kernels = [compiling.compiled(torch.add, (float(i),)) for i in range(2)]
+    one, other = (kernel._torchdynamo_orig_callable.__code__ for kernel in kernels)
+    assert one is not other
+    assert compiling.compiled(torch.add, (0.0,)) is kernels[0]
 
 
 def test_a_failure_on_one_core_is_the_callers(monkeypatch):

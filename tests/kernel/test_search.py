@@ -3,6 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from reflectsep.kernel import compiling, search
+from reflectsep.kernel.compiling import Speed
 from reflectsep.kernel.local import solve_pixels
 from reflectsep.kernel.search import Scan, cubic_minimum, hermite, scan_pixels, search_pixels
 
@@ -41,14 +43,40 @@ def test_more_minima_never_cost_more(scene):
 
 
 def test_pixels_at_once_make_no_difference(scene, monkeypatch):
-    from reflectsep.kernel import search
-
     made = scene(600, sigma=0.01)
     whole = search_pixels(made.problem, made.lobe)
     monkeypatch.setattr(search, "AT_ONCE", 250)
     parts = search_pixels(made.problem, made.lobe)
     assert torch.equal(parts.local, whole.local)
     assert parts.iterations == whole.iterations
+
+
+def test_cores_make_no_difference(scene, monkeypatch):
+    monkeypatch.setattr(compiling, "LEAST_PART", 64)
+    made = scene(900, sigma=0.01)
+    one = search_pixels(made.problem, made.lobe, speed=Speed(cores=1))
+    monkeypatch.setattr(search, "AT_ONCE", 300)
+    three = search_pixels(made.problem, made.lobe, speed=Speed(cores=3))
+    assert torch.equal(one.local, three.local)
+    assert torch.equal(one.cost, three.cost)
+    assert torch.equal(one.status, three.status)
+    assert one.iterations == three.iterations
+
+
+def test_small_parts_of_a_large_problem_are_compiled_like_the_whole(scene, monkeypatch):
+    made, seen = scene(600, sigma=0.01), []
+    monkeypatch.setattr(compiling, "WORTH_COMPILING", 500)
+    monkeypatch.setattr(compiling, "LEAST_PART", 64)
+    monkeypatch.setattr(compiling, "has_compiler", lambda: True)
+    monkeypatch.setattr(search, "AT_ONCE", 100)
+
+    def plain(function, form):
+        seen.append(function.__name__)
+        return lambda *tensors: function(*tensors, *form)
+
+    monkeypatch.setattr(compiling, "compiled", plain)
+    search_pixels(made.problem, made.lobe, speed=Speed(cores=1))
+    assert len(seen) == 3 * len(Speed(cores=1).parts(600, 100))
 
 
 def test_the_cubic_and_its_minimum():
