@@ -130,11 +130,11 @@ class TimeLeft:
     def _slowness(self, kind: Kind) -> float:
         """What a part takes, of what is expected."""
         took, expected = self._evidence(kind)
+        if expected == 0 and kind == "drawing" and self._evidence("solving")[1] > 0:
+            return self._tempered(*self._evidence("solving"))  # both are bound by the processor
         if expected == 0 and kind != "reading":
             # Nothing of its kind has been seen. That reading is slow makes it likely, no more, that all is.
-            others: list[Kind] = ["reading"] if kind == "solving" else ["solving", "reading"]
-            known = next((pair for pair in map(self._evidence, others) if pair[1] > 0), (0.0, 0.0))
-            return math.sqrt(self._tempered(*known))
+            return math.sqrt(self._tempered(*self._evidence("reading")))
         return self._tempered(took, expected)
 
     def _tempered(self, took: float, expected: float) -> float:

@@ -14,14 +14,14 @@ from reflectsep.estimate import Part
 from reflectsep.fit.options import FitOptions
 
 SOLVING_US = {
-    "pixels": (350,),
-    "joint fit": (300,),
-    "shadow edges": (380,),
-    "neighbourhood": (370, 260),
-    "smooth lobes": (270, 150, 150, 105, 110, 93),
+    "pixels": (300,),
+    "joint fit": (230,),
+    "shadow edges": (310,),
+    "neighbourhood": (210, 135),
+    "smooth lobes": (140, 95, 85, 85, 90, 60),
 }
 """Microseconds a pixel of a grey fit of few lights; `_effort` says how it grows with what a pixel has."""
-GLOBALS_S = (9.0, 6.0)
+GLOBALS_S = (3.8, 2.9)
 """Of 300 pixels of a grey fit of few lights; it grows with the power 1.7 of `_effort`."""
 
 
@@ -74,7 +74,7 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
             Part(
                 name=f"sweep {sweep.light} {sweep.direction}: {step}",
                 label=f"sweeps: {step}",
-                expected_s=0.1 + 0.15 * values * sweep.count,
+                expected_s=0.1 + 0.05 * values * sweep.count,
                 kind="reading",
                 steps="even",
             )
@@ -106,6 +106,6 @@ def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
 
 def reporting(counts: Counts, sweeps: int) -> list[Part]:
     """The report: figures of a sweep are its largest share."""
-    figures = sweeps * (0.7 + 19e-6 * counts.size)
-    seconds = 3.5 + figures + 1e-6 * counts.size * counts.lights * counts.channels
+    figures = sweeps * (0.7 + 8e-6 * counts.size)
+    seconds = 8.0 + figures + 2.8e-6 * counts.size * counts.lights * counts.channels
     return [Part(name="report", label="report", expected_s=seconds, kind="drawing", steps="uneven")]

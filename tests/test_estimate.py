@@ -132,26 +132,26 @@ def within_two(seen, *, skip_s=0.0):
     return good / total
 
 
-# Fits as they were timed, on two machines at various loads: counts, sweeps and their frames, seconds of the alignment,
-# of both passes over the sweeps, and of the stages that follow.
+# Fits as they were timed, at various loads: counts, sweeps and their frames, seconds of the alignment, of both passes
+# over the sweeps, and of the stages that follow.
 RUNS = {
     "grey, 96 x 96": (
         Counts(size=9216, pixels=5211, lights=6, channels=1),
-        (4, 49),
-        (5.1, 0.1, 0.4),
-        [6.6, 6.1, 1.3, 2.1, 2.3, 2.2, 2.2, 1.3, 0.9, 1.1, 6.1],
+        (3, 44),
+        (5.5, 0.1, 0.2),
+        [4.2, 3.3, 1.4, 1.0, 1.5, 1.2, 0.7, 0.8, 0.5, 0.4, 10.3],
     ),
     "photographs": (
         Counts(size=174080, pixels=36528, lights=8, channels=3),
         (0, 0),
-        (14.3, 0, 0),
-        [14.4, 14.8, 11.6, 16.3, 22.8, 16.0, 9.5, 7.6, 8.0, 6.8, 6.0],
+        (15.7, 0, 0),
+        [11.1, 14.5, 11.7, 18.9, 11.7, 6.4, 5.9, 5.1, 4.8, 4.9, 19.2],
     ),
     "colour, 512 x 512, on a busy machine": (
         Counts(size=262144, pixels=143007, lights=6, channels=3),
         (3, 60),
-        (64.5, 14.1, 30.3),
-        [31.5, 19.7, 142.4, 79.9, 109.4, 120.6, 64.5, 92.8, 40.7, 43.0, 32.5],
+        (47.5, 5.1, 8.2),
+        [18.8, 9.6, 125.2, 65.6, 112.8, 51.7, 45.2, 68.5, 28.6, 21.6, 56.2],
     ),
 }
 
