@@ -85,7 +85,7 @@ def beside(ours: Separation, baseline: Separation, capture: Capture, still: Stil
     if not listed.is_file() or ours.light_vectors is None:
         return []
     lights = read_lights(listed)
-    mixes = alphas_for(list(lights.values()), ours.light_vectors)
+    mixes = alphas_for(list(lights.values()), ours.light_vectors) if lights else {}
     rows = []
     for name, mix in mixes.items():
         file = capture.folder / "heldout" / f"{name}.exr"

@@ -90,7 +90,7 @@ def plot(rows: list[dict[str, float]], path: str) -> None:
     axes[1].set(xlabel="pixels", ylabel="bytes a pixel beyond inputs and outputs", ylim=(-20, 400))
     axes[1].axhline(150, color="grey", lw=0.8)
     axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=90)
 
 
 def main(arguments: list[str]) -> int:

@@ -15,6 +15,7 @@ from reflectsep.config import JOBS, FitJob, InfoJob, RelightJob, SimulateJob
 from reflectsep.errors import CaptureError
 
 STAND_IN = """
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -27,6 +28,8 @@ def run(job, progress):
     progress("stage", 1, 1)
     if getattr(job, "seed", 0) == 13:
         raise CaptureError(job.out + ": unlucky")
+    if getattr(job, "seed", 0) == 99:
+        os._exit(9)
     Path(job.out).mkdir(parents=True)
     return "wrote " + job.out
 
@@ -230,10 +233,10 @@ def command(tmp_path):
     return run
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+@pytest.mark.parametrize("launcher", ["basic", "joblib", pytest.param("submitit_local", marks=pytest.mark.slow)])
 def test_launchers_leave_only_what_the_jobs_wrote(command, launcher):
-    if launcher == "joblib":
-        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    if launcher != "basic":
+        pytest.importorskip(f"hydra_plugins.hydra_{launcher.split('_')[0]}_launcher")
     done = command("simulate", "-m", "object=wax,pudding", f"hydra/launcher={launcher}")
     assert (done.returncode, sorted(done.stdout.splitlines())) == (0, ["wrote captures/pudding", "wrote captures/wax"])
     found = sorted(str(path.relative_to(command.work)) for path in command.work.rglob("*"))
@@ -247,6 +250,42 @@ def test_joblib_reports_a_failure_in_one_line(command):
     assert (done.returncode, errors) == (1, ["reflectsep: error: seed=13: a13: unlucky"])
     assert "Traceback" not in done.stderr
     assert [path.name for path in command.work.iterdir()] == ["a1"]
+
+
+@pytest.mark.slow
+def test_submitit_reports_a_failure_in_one_line(command):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    done = command("simulate", "-m", "seed=1,13", "out=a${seed}", "hydra/launcher=submitit_local")
+    assert (done.returncode, done.stderr.splitlines()) == (1, ["reflectsep: error: seed=13: a13: unlucky"])
+    assert [path.name for path in command.work.iterdir()] == ["a1"]
+
+
+@pytest.mark.slow
+def test_a_job_that_a_cluster_ends_is_one_line_and_leaves_its_output(command):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    done = command("simulate", "-m", "seed=1,99", "out=a${seed}", "hydra/launcher=submitit_local")
+    assert done.returncode == 1
+    (kept,) = command.work.glob(".reflectsep-jobs-*")
+    assert done.stderr.splitlines()[-1].startswith(f"reflectsep: error: {kept}: a job ended without an answer: ")
+    assert done.stdout.splitlines() == ["wrote a1"]
+
+
+def test_a_cluster_that_is_not_there_is_told_before_anything_is_sent(ran, capsys, monkeypatch, tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    words = ["fit", "-m", "object=wax,pudding", "hydra/launcher=submitit_slurm", "hydra.launcher.partition=day"]
+    assert fails(capsys, words, 2).startswith("hydra/launcher=submitit_slurm: no srun here")
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_slurm"])
+def test_a_launcher_that_is_not_installed_names_its_extra(ran, capsys, monkeypatch, launcher):
+    extra = launcher.split("_")[0]
+    monkeypatch.setitem(sys.modules, f"hydra_plugins.hydra_{extra}_launcher", None)
+    words = ["fit", "-m", "object=wax,pudding", f"hydra/launcher={launcher}"]
+    said = f"hydra/launcher={launcher}: not installed; pip install 'reflectsep[{extra}]'"
+    assert fails(capsys, words, 1) == said
+    assert ran == []
 
 
 @pytest.mark.parametrize("words", [["--help"], ["fit", "--help"], ["--version"]])

@@ -27,6 +27,7 @@ from reflectsep.data import Capture, Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io.ahead import frames_of
 from reflectsep.progress import Progress, silent
+from reflectsep.solve.sharing import by_items
 
 CLIPPED_SHARE = 0.5
 CLIPPED_BESIDE = 0.01
@@ -96,25 +97,35 @@ def align(
     good = ~saturated.any(1) & torch.isfinite(grey)
     grey = torch.where(torch.isfinite(grey), grey, 0.0).double()
     motions = {name: Motion(reason="reference" if i == 0 else "not looked for") for i, name in enumerate(names)}
-    warnings: list[str] = []
     if options.scope == "all":
-        for j in range(1, len(names)):
-            motions[names[j]] = across(grey[0], grey[j], mask, options)
-            progress("alignment", j, len(names) - 1)
-    sweeps, measured = [], []
-    for sweep, stream in zip(capture.sweeps, streams, strict=True):
+
+        def between_lights(i: int) -> dict[str, Any]:
+            found = across(grey[0], grey[i + 1], mask, options)
+            progress("alignment", i + 1, len(names) - 1)
+            return found.plain()
+
+        found = by_items(len(names) - 1, between_lights)
+        motions |= {name: Motion.from_plain(values) for name, values in zip(names[1:], found, strict=True)}
+
+    def same_light(i: int) -> tuple[dict[str, Any], list[str]]:
+        sweep = capture.sweeps[i]
         if sweep.light not in names:
-            sweeps.append(Motion(reason="its light has no full picture"))
-            measured.append(sweeps[-1])
-            continue
+            return Motion(reason="its light has no full picture").plain(), []
         k = list(names).index(sweep.light)
-        added = add_frames(stream, options.n_d, progress)
-        warnings += _too_long(sweep, added, mask)
+        added = add_frames(streams[i], options.n_d, progress)
         own = _same_light(grey[k], good[k], mask, motions[sweep.light], added, options)
+        said = _too_long(sweep, added, mask)
         if own.reason.startswith("clipped"):
-            warnings.append(f"sweep of {sweep.light} along {sweep.direction}: not registered, {own.reason}")
-        measured.append(own)
-        sweeps.append(_composed(own, motions[sweep.light], mask))
+            said.append(f"sweep of {sweep.light} along {sweep.direction}: not registered, {own.reason}")
+        return own.plain(), said
+
+    of_sweeps = by_items(len(capture.sweeps), same_light)
+    measured = [Motion.from_plain(own) for own, _ in of_sweeps]
+    sweeps = [
+        _composed(own, motions[sweep.light], mask) if sweep.light in names else own
+        for sweep, own in zip(capture.sweeps, measured, strict=True)
+    ]
+    warnings = [text for _, said in of_sweeps for text in said]
     return Alignment(
         pictures=motions,
         sweeps=tuple(sweeps),

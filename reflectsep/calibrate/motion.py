@@ -64,6 +64,16 @@ class Motion:
         shift[0, 2], shift[1, 2] = time * self.velocity[0], time * self.velocity[1]
         return shift @ self.matrix
 
+    def plain(self) -> dict[str, Any]:
+        """Every field in values that JSON has, exactly; `Motion.from_plain` takes them back."""
+        return {**vars(self), "matrix": self.matrix.tolist()}
+
+    @classmethod
+    def from_plain(cls, values: dict[str, Any]) -> Motion:
+        """What `plain` gave."""
+        x, y = values["velocity"]
+        return cls(**{**values, "matrix": torch.tensor(values["matrix"], dtype=torch.float64), "velocity": (x, y)})
+
     def document(self) -> dict[str, Any]:
         """As it stands in JSON."""
         return {

@@ -79,7 +79,7 @@ jobs:
 
 options:
   -h, --help      this text; after a job, its settings
-  -m, --multirun  KEY=A,B runs once for A and once for B; hydra/launcher=joblib runs them side by side
+  -m, --multirun  KEY=A,B runs once for A and once for B; hydra/launcher=joblib (submitit_slurm): side by side
   --json          of `check`: print JSON for scripts
   --cfg           print the settings of a job, do not run it
   --version

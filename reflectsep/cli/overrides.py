@@ -10,7 +10,9 @@ import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from itertools import product
+from shutil import which
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -224,13 +226,21 @@ def _check_override(cls: type, override: Override, sweeping: bool) -> None:
         raise SettingsError(f"{override.input_line}: expected {known[key].expected}")
 
 
+def launcher_of(overrides: Sequence[str]) -> str:
+    """Name of the launcher that the runs of a multirun go through."""
+    return next((str(o.value()) for o in _parsed(overrides) if o.key_or_group == "hydra/launcher"), "basic")
+
+
 def _check_launcher(name: str) -> None:
-    if name != "joblib":
+    extra = name.split("_", maxsplit=1)[0]
+    if extra not in ("joblib", "submitit"):
         return
     try:
-        import hydra_plugins.hydra_joblib_launcher  # noqa: F401  # pyright: ignore[reportMissingImports]
+        import_module(f"hydra_plugins.hydra_{extra}_launcher")
     except ImportError:
-        raise MissingExtraError("hydra/launcher=joblib: not installed; pip install 'reflectsep[joblib]'") from None
+        raise MissingExtraError(f"hydra/launcher={name}: not installed; pip install 'reflectsep[{extra}]'") from None
+    if name == "submitit_slurm" and which("srun") is None:
+        raise SettingsError(f"hydra/launcher={name}: no srun here; start it on a machine that submits jobs")
 
 
 def _values(override: Override) -> list[Any]:

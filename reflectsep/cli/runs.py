@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -17,8 +16,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from reflectsep.cli.cluster import scratch
 from reflectsep.cli.command import complain
-from reflectsep.cli.overrides import build, checked, expanded, flat, hydra_ready, settings_of, swept
+from reflectsep.cli.overrides import build, checked, expanded, flat, hydra_ready, launcher_of, settings_of, swept
 from reflectsep.config import Job
 from reflectsep.errors import ReflectsepError, SettingsError
 from reflectsep.progress import shown, silent
@@ -59,18 +59,20 @@ def several(job: str, words: Sequence[str], *, lines: bool = False) -> int:
 
     Raises:
         SettingsError: any of the runs is impossible, or two would write to one place.
+        WorkerError: a job on a cluster ended without an answer.
     """
-    with hydra_ready(), tempfile.TemporaryDirectory(prefix="reflectsep-") as scratch:
+    with hydra_ready():
         overrides = checked(job, words, sweeping=True)
         own = [word for word in overrides if not word.startswith(("hydra.", "hydra/"))]
         _check_places([(run, settings_of(job, run)) for run in expanded(own)])
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None  # hydra_ready made it
-        quiet = [*_QUIET, f"hydra.sweep.dir='{scratch}'"]  # Hydra insists on a folder for its multirun.yaml
-        try:
-            batches = hydra.multirun(f"{job}_job", partial(_task, job, swept(own), lines), [*overrides, *quiet])
-        except (HydraException, OmegaConfBaseException) as error:
-            raise SettingsError(flat(error)) from None
+        with scratch(launcher_of(overrides)) as folder:
+            quiet = [*_QUIET, f"hydra.sweep.dir='{folder}'"]
+            try:
+                batches = hydra.multirun(f"{job}_job", partial(_task, job, swept(own), lines), [*overrides, *quiet])
+            except (HydraException, OmegaConfBaseException) as error:
+                raise SettingsError(flat(error)) from None
     return max((code for code in _codes(batches)), default=0)
 
 

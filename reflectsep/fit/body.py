@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.model import signed_root
 
 LIT_FRACTION = 0.4
@@ -27,6 +28,14 @@ def robust_body(
     `weight` is 1 / standard deviation of every value. Values above the model are highlights and count less than
     values below it, which are noise or cast shadows.
     """
+
+    def of(cut: slice) -> Tensor:
+        return _robust_body(images[cut], weight[cut], alpha, n_d, iterations)
+
+    return in_chunks(len(images), of)
+
+
+def _robust_body(images: Tensor, weight: Tensor, alpha: Tensor, n_d: float, iterations: int) -> Tensor:
     root = signed_root(images, n_d)
     ridge = 1e-6 * torch.eye(3, dtype=images.dtype)
     relative = (weight / weight.amax(-1, keepdim=True).clamp_min(1e-30)).clamp_min(1e-6)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.fit.blocks import build_problem
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.neighbours import MAD_TO_SD, smooth
 from reflectsep.fit.problem import (
     Locals,
@@ -67,9 +68,13 @@ def noise_level(
 
     The median over pixels, so that highlights and shadows have no say; never below 0.03 % of the peak.
     """
+    return noise_of(images, residual.square().mean((1, 2)).sqrt(), unknowns)
+
+
+def noise_of(images: Float[Tensor, "pixels channels lights"], rms: Float[Tensor, "pixels"], unknowns: float) -> float:
+    """`noise_level` from the root mean square of every pixel's residuals."""
     lights = images.shape[-1]
     freedom = max(lights - unknowns, 0.5) / lights
-    rms = residual.square().mean((1, 2)).sqrt()
     return max(float(rms.median()) / freedom**0.5, 3e-4 * near_maximum(images.amax((1, 2))))
 
 
@@ -90,7 +95,8 @@ def unknowns_in_effect(obs: Observations, priors: Priors, local: Tensor, shared:
 
 def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float) -> Priors:
     """What can be expected before any lobe is fitted."""
-    above = (obs.images - (body @ obs.alpha.mT).clamp_min(0.0)).mean(1).amax(-1)
+    top = lambda cut: (obs.images[cut] - (body[cut] @ obs.alpha.mT).clamp_min(0.0)).mean(1).amax(-1)  # noqa: E731
+    above = in_chunks(len(obs), top)
     highest = near_maximum(above)
     priors = replace(
         no_priors(len(obs), obs.images),
@@ -105,11 +111,15 @@ def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], si
 
 def parallel_spread(obs: Observations, body: Float[Tensor, "pixels channels 3"]) -> float:
     """How far the whole diffuse root is from parallel to s, relative to |s|: median standard deviation of a light."""
-    s = obs.s_basis
-    size = s.square().sum(-1, keepdim=True).sqrt()
-    along = (body * s).sum(-1, keepdim=True) / size.square().clamp_min(1e-12)
-    off = (body - along * s).square().sum(-1).sqrt().mean(-1)
-    size = size[..., 0].mean(-1)
+
+    def off_and_size(cut: slice) -> Tensor:
+        s = obs.s_basis[cut]
+        size = s.square().sum(-1, keepdim=True).sqrt()
+        along = (body[cut] * s).sum(-1, keepdim=True) / size.square().clamp_min(1e-12)
+        off = (body[cut] - along * s).square().sum(-1).sqrt().mean(-1)
+        return torch.stack([off, size[..., 0].mean(-1)], -1)
+
+    off, size = in_chunks(len(obs), off_and_size).unbind(-1)
     lit = size > 0.1 * size.max()
     return float((off[lit] / size[lit]).median()) / RAYLEIGH
 

@@ -13,7 +13,10 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import conv2d, pad, unfold
 
+from reflectsep.fit.chunks import in_chunks
+
 MAD_TO_SD = 1.4826
+PIXELS_OF_A_BAND = 1 << 16
 QUADRATIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of x and y of a quadratic surface."""
 
@@ -55,8 +58,20 @@ def local_median(
     values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"], radius: int
 ) -> Float[Tensor, "pixels channels"]:
     """Median of the neighbours, channel by channel; a pixel without neighbours keeps its own value."""
-    median = neighbourhood(values, mask, radius).nanmedian(-1).values
-    return torch.where(median.isfinite(), median, values)
+    result, (height, width), at = torch.empty_like(values), mask.shape, 0
+    band = max(1, PIXELS_OF_A_BAND // width)
+    before = mask.sum(1).cumsum(0).tolist()
+    # Band by band, with the rows that its windows reach into: the windows are far larger than the picture.
+    for top in range(0, height, band):
+        first, last = max(0, top - radius), min(height, top + band + radius)
+        pixels = slice(before[first - 1] if first else 0, before[last - 1])
+        wanted = torch.zeros_like(mask[first:last])
+        wanted[top - first : top - first + band] = True
+        windows = neighbourhood(values[pixels], mask[first:last], radius)[wanted[mask[first:last]]]
+        end = before[min(top + band, height) - 1]
+        result[at:end] = windows.nanmedian(-1).values
+        at = end
+    return torch.where(result.isfinite(), result, values)
 
 
 def local_quadratic(
@@ -95,11 +110,17 @@ def local_quadratic(
 
     powers = {(a + c, b + d) for a, b in QUADRATIC for c, d in QUADRATIC}
     moments = {power: moment(*power, 0)[:, 0] for power in sorted(powers)}
-    system = torch.stack([torch.stack([moments[a + c, b + d] for c, d in QUADRATIC], -1) for a, b in QUADRATIC], -2)
     right = torch.stack([moment(a, b, 1) for a, b in QUADRATIC], 1)
-    unit = system.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
     # A trace of a ridge: where few neighbours are left the surface is flatter rather than wild.
     ridge = 1e-4 * torch.eye(len(QUADRATIC), dtype=values.dtype)
-    inverse = torch.linalg.inv(system * unit[:, :, None] * unit[:, None, :] + ridge)
-    surface = (inverse @ (right * unit[:, :, None])) * unit[:, :, None]
-    return surface[:, 0], inverse[:, 0, 0] * unit[:, 0].square()
+
+    def centre(cut: slice) -> Tensor:
+        rows = [torch.stack([moments[a + c, b + d][cut] for c, d in QUADRATIC], -1) for a, b in QUADRATIC]
+        system = torch.stack(rows, -2)
+        unit = system.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
+        inverse = torch.linalg.inv(system * unit[:, :, None] * unit[:, None, :] + ridge)
+        surface = (inverse @ (right[cut] * unit[:, :, None])) * unit[:, :, None]
+        return torch.cat([surface[:, 0], (inverse[:, 0, 0] * unit[:, 0].square())[:, None]], -1)
+
+    found = in_chunks(len(values), centre)
+    return found[:, :-1], found[:, -1]

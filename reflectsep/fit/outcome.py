@@ -8,6 +8,7 @@ from torch import Tensor
 
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.fit.blocks import build_problem
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     ALPHA,
@@ -46,7 +47,6 @@ def describe(
     covariance = shared_covariance(state)
     local_sd = local_deviation(state, covariance)
     sd = unpack(local_sd, obs.channels)
-    misfit = picture_residual(state)
     B, B_sd = x.B, x.B * sd.log_B
     picture = lambda values: to_picture(values, mask)  # noqa: E731
     alpha, alpha_sd, strength = refined_alpha(state, intensity, covariance)
@@ -59,15 +59,15 @@ def describe(
         global_names=tuple(n for n, free in zip(names_of(stack, state), state.free.tolist(), strict=True) if free),
         covariance=covariance[state.free][:, state.free],
         d=picture(x.d),
-        s=picture(s_of_lights(x, refined(obs, shared))),
+        s=picture(in_chunks(len(obs), lambda cut: s_of_pixels(state, cut))),
         B=picture(B[:, None, None].expand(-1, obs.channels, 1))[0],
         d_sd=picture(sd.d),
         B_sd=picture(B_sd[:, None, None].expand(-1, obs.channels, 1))[0],
-        residual=picture(-misfit * intensity),
+        residual=picture(in_chunks(len(obs), lambda cut: (-picture_residual(state, cut) * intensity).float())),
         intensity=strength.float(),
         alpha=alpha,
         alpha_sd=alpha_sd,
-        flags=final_flags(state, stack, scattering, misfit),
+        flags=final_flags(state, stack, scattering),
         noise=state.sigma,
         cost=float(state.found.cost.sum()),
         iterations=state.joint.iterations if state.joint is not None else 0,
@@ -103,11 +103,18 @@ def to_picture(values: Float[Tensor, "pixels channels maps"], mask: Tensor) -> F
     return picture
 
 
-def picture_residual(state: State) -> Float[Tensor, "pixels channels lights"]:
-    """Model minus picture of every value, lights of unit intensity."""
-    rows = pixel_residual(state.found.local, state.shared, state.obs, state.priors)
-    count = state.obs.images[0].numel()
-    return rows[:, :count].view_as(state.obs.images) / state.obs.weight
+def s_of_pixels(state: State, cut: slice) -> Float[Tensor, "some channels lights"]:
+    """Scattering roots of every light at some of the pixels, float32."""
+    obs = refined(state.obs.take(cut), state.shared)
+    return s_of_lights(unpack(state.found.local[cut], obs.channels), obs).float()
+
+
+def picture_residual(state: State, cut: slice) -> Float[Tensor, "some channels lights"]:
+    """Model minus picture of every value of some of the pixels, lights of unit intensity."""
+    obs = state.obs.take(cut)
+    rows = pixel_residual(state.found.local[cut], state.shared, obs, state.priors.take(cut))
+    count = obs.images[0].numel()
+    return rows[:, :count].view_as(obs.images) / obs.weight
 
 
 def shared_covariance(state: State) -> Float[Tensor, "G G"]:
@@ -144,14 +151,18 @@ def final_flags(
     state: State,
     stack: PhotometricStack,
     scattering: Scattering | None,
-    misfit: Float[Tensor, "pixels channels lights"],
 ) -> Int[Tensor, "height width"]:
     """Flags of the stack and of the scattering, and what the fit itself noticed."""
     obs, found = state.obs, state.found
     flags = stack.flags if scattering is None else stack.flags | scattering.flags
     x = unpack(found.local, obs.channels)
-    shine = lobe_pictures(obs, found.local, state.shared).amax(-1)
-    unlike = torch.where(obs.clipped, misfit.clamp_max(0.0), misfit).abs().amax((1, 2)) > OUTLIER * state.sigma
+    shine = in_chunks(len(obs), lambda cut: shine_of(state, cut).amax(-1))
+
+    def misfit(cut: slice) -> Tensor:
+        found = picture_residual(state, cut)
+        return torch.where(obs.clipped[cut], found.clamp_max(0.0), found).abs().amax((1, 2))
+
+    unlike = in_chunks(len(obs), misfit) > OUTLIER * state.sigma
     marks = {
         Flag.FAINT_LOBE: shine < 3.0 * state.sigma,
         Flag.NOT_CONVERGED: ~found.converged,
@@ -167,11 +178,16 @@ def final_flags(
     return mark(flags, ~stack.mask, Flag.OUTSIDE_MASK)
 
 
+def shine_of(state: State, cut: slice) -> Float[Tensor, "some lights"]:
+    """`lobe_pictures` of some of the pixels."""
+    return lobe_pictures(state.obs, state.found.local[cut], state.shared)
+
+
 def warnings(state: State, options: FitOptions) -> tuple[str, ...]:
     """What a person should know before trusting the numbers."""
     said = []
-    shine = lobe_pictures(state.obs, state.found.local, state.shared)
-    seen = int(((shine > 3.0 * state.sigma).sum(-1) >= 2).sum())
+    in_two = lambda cut: (shine_of(state, cut) > 3.0 * state.sigma).sum(-1) >= 2  # noqa: E731
+    seen = int(in_chunks(len(state.obs), in_two).sum())
     if seen < 30:
         said.append(
             f"only {seen} pixels show the highlight in two or more pictures: n_s, a and B rest on the prior; "

@@ -77,7 +77,7 @@ class Observations:
         """Scattering roots of the basis lights."""
         return self.s[..., :3]
 
-    def take(self, index: Tensor) -> Observations:
+    def take(self, index: Tensor | slice) -> Observations:
         """Some of the pixels."""
         return replace(
             self,
@@ -127,7 +127,7 @@ class Priors:
     alpha_sd: float = 0.02
     """Standard deviation of a stated alpha, of lights of unit intensity."""
 
-    def take(self, index: Tensor) -> Priors:
+    def take(self, index: Tensor | slice) -> Priors:
         """Some of the pixels."""
         return replace(
             self,
@@ -189,6 +189,11 @@ def unpack(local: Tensor, channels: int) -> Locals:
 def mixing_of(obs: Observations, shared: Float[Tensor, "G"]) -> Mixing:
     """Alphas as `shared` has them."""
     return mixing(obs.alpha, shared[ALPHA:], torch.linalg.inv(obs.normal_map) if obs.lights_known else None)
+
+
+def alpha_of(obs: Observations, shared: Float[Tensor, "G"]) -> Float[Tensor, "lights 3"]:
+    """Alphas as `shared` has them, the stated ones where they are held."""
+    return obs.alpha if len(shared) == ALPHA else mixing_of(obs, shared).alpha
 
 
 def refined(obs: Observations, shared: Float[Tensor, "G"]) -> Observations:

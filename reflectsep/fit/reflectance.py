@@ -17,10 +17,11 @@ from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.body import extend_into_shadow, robust_body
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.expectations import (
     first_priors,
     near_maximum,
-    noise_level,
+    noise_of,
     shape_spread,
     unknowns_in_effect,
     with_facing,
@@ -117,20 +118,21 @@ def observe(
     alpha = stack.alpha.to(dtype)
     if known:
         alpha = (vectors / intensity[:, None]) @ torch.linalg.inv(basis)
-    images = stack.images.to(dtype)[..., mask].permute(2, 1, 0) / intensity
+    images = flattened(stack.images, mask, intensity)
+    high, low = float(images.amax()), float(images.amin())
     # Not exactly 0 for equal pictures: dividing by the intensities rounds.
-    if not float(images.amax() - images.amin()) > 1e-6 * float(images.abs().amax()):
+    if not high - low > 1e-6 * max(high, -low):
         raise FitError("the pictures have no contrast inside the mask")
     use = scattering is not None and options.scattering != "none"
     n_d = scattering.n_d if use and scattering is not None else 1.0
     s = torch.zeros_like(images)
     if use and scattering is not None:
-        s = scattering.root.to(dtype)[..., mask].permute(2, 1, 0) / intensity ** (1.0 / n_d)
+        s = flattened(scattering.root, mask, intensity ** (1.0 / n_d))
     obs = Observations(
-        images=images.contiguous(),
-        s=s.contiguous(),
-        weight=torch.ones_like(images),
-        clipped=stack.saturated[..., mask].permute(2, 1, 0).contiguous(),
+        images=images,
+        s=s,
+        weight=images.new_ones(()).expand_as(images),
+        clipped=flattened(stack.saturated, mask),
         alpha=alpha,
         normal_map=torch.linalg.inv(basis),
         view=view,
@@ -145,25 +147,33 @@ def observe(
     return obs, mask, intensity
 
 
+def flattened(
+    pictures: Tensor, mask: Bool[Tensor, "height width"], divisor: Float[Tensor, "lights"] | None = None
+) -> Tensor:
+    """Pictures (lights, channels, height, width) as (pixels, channels, lights), divided light by light."""
+    kind = pictures.dtype if divisor is None else divisor.dtype
+    result = torch.empty(int(mask.sum()), pictures.shape[1], len(pictures), dtype=kind)
+    for j, picture in enumerate(pictures):
+        values = picture[:, mask].to(kind).T
+        result[..., j] = values if divisor is None else values / divisor[j]
+    return result
+
+
 def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitOptions) -> State:
     """Noise, robust body, scattering beyond the shadow's edge, first priors."""
     n_d = obs.n_d_swept
     scale = near_maximum(obs.images.amax((1, 2)))
     if not scale > 0:
         raise FitError(f"the brightest picture values inside the mask are {scale:.3g}: nothing to fit")
-    body = robust_body(obs.images, torch.full_like(obs.images, 100.0 / scale), obs.alpha, n_d)
-    flat = obs.images.new_zeros(())
-    sigma = noise_level(obs.images, obs.images - diffuse(body @ obs.alpha.mT, flat, n_d), 3)
-    body = robust_body(obs.images, torch.full_like(obs.images, 1.0 / sigma), obs.alpha, n_d)
-    measured = obs.s.clone()
-    extended = extend_into_shadow(obs.s_basis, body) if bool((obs.s != 0).any()) else obs.s_basis
-    mixed = extended @ obs.alpha.mT
-    linear = obs.s_basis @ obs.alpha.mT
-    # Lights with a sweep of their own keep what was measured, moved with the extension beyond the shadow's edge.
-    own = torch.tensor(obs.swept or [False] * len(obs.alpha))
-    s = torch.where(own, measured.minimum(measured + mixed - linear), mixed)
-    s[..., :3] = extended
-    obs = replace(obs, s=s, weight=weights(obs, options, sigma))
+    alike = lambda weight: obs.images.new_tensor(weight).expand_as(obs.images)  # noqa: E731
+    body, flat = robust_body(obs.images, alike(100.0 / scale), obs.alpha, n_d), obs.images.new_zeros(())
+
+    def rms(cut: slice) -> Tensor:
+        return (obs.images[cut] - diffuse(body[cut] @ obs.alpha.mT, flat, n_d)).square().mean((1, 2)).sqrt()
+
+    sigma = noise_of(obs.images, in_chunks(len(obs), rms), 3)
+    body = robust_body(obs.images, alike(1.0 / sigma), obs.alpha, n_d)
+    obs = replace(obs, s=beyond_the_edge(obs, body), weight=weights(obs, options, sigma))
     priors = replace(first_priors(obs, body, sigma), log_n_d=math.log(n_d), n_d_sd=obs.n_d_sd)
     if options.prior == "none":
         bare = no_priors(len(obs), obs.images)
@@ -199,18 +209,38 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     )
 
 
+def beyond_the_edge(
+    obs: Observations, body: Float[Tensor, "pixels channels 3"]
+) -> Float[Tensor, "pixels channels lights"]:
+    """Scattering roots of all lights, going on below zero beyond the edge of an attached shadow."""
+    any_at_all = bool(obs.s.any())
+    # Lights with a sweep of their own keep what was measured, moved with the extension beyond the shadow's edge.
+    own = torch.tensor(obs.swept or [False] * len(obs.alpha))
+
+    def roots(cut: slice) -> Tensor:
+        measured, basis = obs.s[cut], obs.s_basis[cut]
+        extended = extend_into_shadow(basis, body[cut]) if any_at_all else basis
+        mixed = extended @ obs.alpha.mT
+        linear = basis @ obs.alpha.mT
+        s = torch.where(own, measured.minimum(measured + mixed - linear), mixed)
+        s[..., :3] = extended
+        return s
+
+    return in_chunks(len(obs), roots)
+
+
 def scattering_weight(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels"]:
     """1 / standard deviation of the measured s: that of the method, and the noise of its frames."""
     return 1.0 / (options.scattering_sd * obs.s_basis.square().mean((1, 2)).sqrt() + sigma)
 
 
 def weights(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels channels lights"]:
-    """sqrt(lambda_j) / sigma of every value (Eq. 22)."""
+    """sqrt(lambda_j) / sigma of every value (Eq. 22), in the memory of one pixel."""
     factor = torch.full((obs.images.shape[-1],), options.lambda_other, dtype=obs.images.dtype)
     factor[:3] = options.lambda_basis
     if options.weights == "noise":
         factor = torch.ones_like(factor)
-    return (factor.sqrt() / sigma).expand_as(obs.images).contiguous()
+    return (factor.sqrt() / sigma).expand_as(obs.images)
 
 
 def start(state: State, options: FitOptions, progress: Progress) -> State:
@@ -248,8 +278,8 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
     if options.prior == "auto" and obs.lights_known:
         # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
         vote = (state.found.cost <= state.found.cost.quantile(effort.trim)).nonzero()[:, 0]
-        shine = lobe_pictures(obs, state.found.local, state.shared)[vote]
-        spread = shape_spread(obs.take(vote), state.found.local[vote], state.shared, shine, state.sigma)
+        shine = in_chunks(len(vote), lambda cut: lobe_pictures(obs, state.found.local[vote[cut]], state.shared))
+        spread = shape_spread(obs, state.found.local[vote], state.shared, shine, state.sigma)
         shape = max(state.priors.shape, 1.0 / spread)
         state = rescored(replace(state, priors=replace(state.priors, shape=shape)))
     return state
@@ -257,9 +287,9 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
 
 def with_noise_of_fit(state: State, options: FitOptions) -> State:
     """The noise as the fit itself leaves it: the first figure, from before any lobe was known, is too large."""
-    misfit = picture_residual(state)
+    rms = in_chunks(len(state.obs), lambda cut: picture_residual(state, cut).square().mean((1, 2)).sqrt())
     unknowns = unknowns_in_effect(state.obs, state.priors, state.found.local, state.shared)
-    return with_noise(state, options, noise_level(state.obs.images, misfit, unknowns))
+    return with_noise(state, options, noise_of(state.obs.images, rms, unknowns))
 
 
 def with_noise(state: State, options: FitOptions, sigma: float) -> State:

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.problem import (
     LOG_C_2,
     LOG_N_S,
@@ -162,9 +163,13 @@ def informative_pixels(
     Every second of the most telling 2 x count, so that not only the cores of a few highlights speak.
     """
     n_d = obs.n_d_swept
-    above = (obs.images - diffuse(body @ obs.alpha.mT, body.new_zeros(()), n_d)).mean(1) * obs.weight.mean(1)
-    score = above.clamp_min(0.0).clamp_max(50.0).square().sum(-1)
-    order = score.argsort(descending=True)
+
+    def score(cut: slice) -> Tensor:
+        plain = diffuse(body[cut] @ obs.alpha.mT, body.new_zeros(()), n_d)
+        above = (obs.images[cut] - plain).mean(1) * obs.weight[cut].mean(1)
+        return above.clamp_min(0.0).clamp_max(50.0).square().sum(-1)
+
+    order = in_chunks(len(obs), score).argsort(descending=True)
     return order[: 2 * count : 2] if len(order) >= 2 * count else order[:count]
 
 

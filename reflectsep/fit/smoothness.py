@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.fit.blocks import build_problem
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.expectations import VISIBLE
 from reflectsep.fit.neighbours import local_quadratic
 from reflectsep.fit.problem import LOG_C_2, Priors, normalised_lobe, unpack
@@ -78,8 +79,12 @@ def lobe_variance(state: State) -> Float[Tensor, "pixels"]:
 
 def clearly_seen(state: State, variance: Tensor) -> Bool[Tensor, "pixels"]:
     """Pixels whose lobe is well above the noise in two pictures, and well determined."""
-    shine = lobe_pictures(state.obs, state.found.local, state.shared)
-    seen = (shine > 2.0 * VISIBLE * state.sigma).sum(-1) >= 2
+
+    def in_two(cut: slice) -> Tensor:
+        shine = lobe_pictures(state.obs, state.found.local[cut], state.shared)
+        return (shine > 2.0 * VISIBLE * state.sigma).sum(-1) >= 2
+
+    seen = in_chunks(len(state.obs), in_two)
     if not bool(seen.any()):
         return seen
     return seen & (variance < 4.0 * variance[seen].median())

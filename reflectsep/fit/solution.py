@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reflectsep.fit.blocks import build_problem
+from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.neighbours import local_median
 from reflectsep.fit.problem import (
     LOG_N_D,
@@ -19,6 +20,7 @@ from reflectsep.fit.problem import (
     Locals,
     Observations,
     Priors,
+    alpha_of,
     refined,
     unpack,
     unpack_globals,
@@ -191,7 +193,7 @@ def fit_everything(
     rest[vote] = False
     index = rest.nonzero()[:, 0]
     if len(index):
-        others = local_in_chunks(problem.take(index), local[index], joint.shared, effort.polish, effort.chunk)
+        others = local_in_chunks(problem, local[index], joint.shared, effort.polish, effort.chunk, index)
         local[index], settled[index] = others.local, others.converged
     return replace(joint, local=local, settled=settled)
 
@@ -229,9 +231,20 @@ def offer_lobes(
     which = worth_trying(obs, found.local, shared, lobe_vector)
     if len(which) == 0:
         return found
-    everywhere, lobe_vector = len(obs), lobe_vector[which]
-    obs, priors = obs.take(which), priors.take(which)
-    x = unpack(found.local[which], obs.channels)
+    start = in_chunks(
+        len(which), lambda cut: with_that_lobe(obs, found.local, shared, lobe_vector[which[cut]], which[cut])
+    )
+    problem = build_problem(obs, priors, robust=robust)
+    tried = local_in_chunks(problem, start, shared, effort.polish, effort.chunk, which)
+    return merge(found, which, tried.local, tried.cost, tried.converged, len(obs))
+
+
+def with_that_lobe(
+    obs: Observations, local: Tensor, shared: Tensor, lobe_vector: Float[Tensor, "some 3"], which: Int[Tensor, "some"]
+) -> Float[Tensor, "some P"]:
+    """Starts of the pixels `which` whose lobes are `lobe_vector`: what these leave of the pictures is diffuse."""
+    obs = obs.take(which)
+    x = unpack(local[which], obs.channels)
     globals_ = unpack_globals(shared, obs.n_d)
     shine = lobe(globals_.a + lobe_vector, globals_.n_s, globals_.haze)
     s = obs.s_basis if x.s is None else x.s
@@ -241,22 +254,23 @@ def offer_lobes(
     mean = d.mean((1, 2))
     usable = (mean > 1e-6) & (lobe_vector.mean(-1) > 1e-6)
     log_B = torch.where(usable, (lobe_vector.mean(-1) / mean.clamp_min(1e-9)).clamp_min(1e-9).log(), x.log_B)
-    start = Locals(d, log_B, x.s).pack()
-    problem = build_problem(obs, priors, robust=robust)
-    tried = local_in_chunks(problem, start, shared, effort.polish, effort.chunk)
-    return merge(found, which, tried.local, tried.cost, tried.converged, everywhere)
+    return Locals(d, log_B, x.s).pack()
 
 
 def worth_trying(
     obs: Observations, local: Tensor, shared: Float[Tensor, "G"], lobe_vector: Float[Tensor, "pixels 3"]
 ) -> Int[Tensor, "some"]:
     """Pixels that another lobe could lead elsewhere: not where it is the present one, nor where neither is seen."""
-    obs = refined(obs, shared)
-    x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
-    own = x.B[:, None] * x.d.mean(1)
-    same = (lobe_vector - own).norm(dim=-1) <= SAME_LOBE * own.norm(dim=-1)
-    visible = lambda v: (lobe((g.a + v) @ obs.alpha.mT, g.n_s, g.haze) * obs.weight.mean(1)).amax(-1) > UNSEEN  # noqa: E731
-    return (~same & (visible(own) | visible(lobe_vector))).nonzero()[:, 0]
+
+    def worth(cut: slice) -> Tensor:
+        part, other = refined(obs.take(cut), shared), lobe_vector[cut]
+        x, g = unpack(local[cut], obs.channels), unpack_globals(shared, obs.n_d)
+        own = x.B[:, None] * x.d.mean(1)
+        same = (other - own).norm(dim=-1) <= SAME_LOBE * own.norm(dim=-1)
+        peak = lambda v: (lobe((g.a + v) @ part.alpha.mT, g.n_s, g.haze) * part.weight.mean(1)).amax(-1)  # noqa: E731
+        return ~same & ((peak(own) > UNSEEN) | (peak(other) > UNSEEN))
+
+    return in_chunks(len(local), worth).nonzero()[:, 0]
 
 
 def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) -> Float[Tensor, "8"]:
@@ -272,4 +286,4 @@ def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) 
 def lobe_pictures(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels lights"]:
     """Off-specular value of every pixel and light."""
     x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
-    return lobe(lobe_argument(x.d, x.B, g.a, refined(obs, shared).alpha), g.n_s, g.haze)
+    return lobe(lobe_argument(x.d, x.B, g.a, alpha_of(obs, shared)), g.n_s, g.haze)

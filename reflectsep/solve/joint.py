@@ -148,12 +148,17 @@ def costs_in_chunks(problem: BlockProblem, local: Tensor, shared: Tensor, chunk:
 
 
 def local_in_chunks(
-    problem: BlockProblem, local: Tensor, shared: Tensor, termination: Termination, chunk: int
+    problem: BlockProblem,
+    local: Tensor,
+    shared: Tensor,
+    termination: Termination,
+    chunk: int,
+    which: Tensor | None = None,
 ) -> LocalSolution:
-    """`solve_local`, chunk by chunk."""
+    """`solve_local`, chunk by chunk; of the blocks `which` alone, whose places `local` are, where it is given."""
 
     def solved(cut: slice) -> tuple[Tensor, ...]:
-        part = solve_local(problem.take(cut), local[cut], shared, termination)
+        part = solve_local(problem.take(cut if which is None else which[cut]), local[cut], shared, termination)
         return part.local, part.cost, part.converged, torch.tensor([part.iterations])
 
     places, cost, converged, iterations = by_chunks(len(local), chunk, solved)

@@ -2,11 +2,13 @@
 
 Every process knows the whole problem; chunks go to the processes in turn, and what each finds is handed to all of
 them. Results stand in the order of the chunks and sums are formed from those of the chunks in that order, so that N
-processes give the same numbers as one, bit for bit: along a flat valley, rounding alone would lead them apart.
+processes give the same numbers as one, bit for bit: along a flat valley, rounding alone would lead them apart. For the
+same reason the cuts depend on the number of blocks alone, never on that of the processes.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +22,10 @@ from torch import Tensor
 
 from reflectsep.errors import ReflectsepError, SaidElsewhereError, WorkerError
 
+SHARES = 4
+"""Several chunks come in multiples of so many: three for two processes would keep one of them waiting."""
+ALIGNED = 64
+"""Blocks."""
 PATIENCE = timedelta(minutes=30)
 """How long a process waits for the others. One that dies is noticed at once; this is for one that hangs."""
 
@@ -87,13 +93,13 @@ def by_chunks(count: int, chunk: int, work: Callable[[slice], tuple[Tensor, ...]
 
     Args:
         count: blocks in all, at least one.
-        chunk: blocks at once.
+        chunk: blocks at once, at most.
         work: from a chunk to tensors; the same number of them, with the same trailing shapes, for all chunks.
 
     Raises:
         WorkerError: another process of the run is gone.
     """
-    cuts = [slice(i, min(i + chunk, count)) for i in range(0, count, chunk)]
+    cuts = cuts_of(count, chunk)
     crew = workers()
     if crew.count > len(cuts):
         crew = _ALONE  # not one for each: then everybody does all of it, which is as quick
@@ -106,6 +112,37 @@ def by_chunks(count: int, chunk: int, work: Callable[[slice], tuple[Tensor, ...]
     if crew.count == 1:
         return tuple(torch.cat(parts) for parts in columns)
     return tuple(_gather(list(parts), crew, len(cuts)) for parts in columns)
+
+
+def cuts_of(count: int, chunk: int) -> list[slice]:
+    """0 .. count - 1 in chunks of `chunk` at most, all but the last of one length; one chunk, or `SHARES` or more."""
+    number = -(-count // chunk)
+    if number > 1:
+        even = -(-count // (SHARES * -(-number // SHARES)))
+        # Whole vectors of the processor, where they fit.
+        chunk = min(chunk, -(-even // ALIGNED) * ALIGNED) if even >= ALIGNED else even
+    return [slice(i, min(i + chunk, count)) for i in range(0, count, chunk)]
+
+
+def by_items(count: int, work: Callable[[int], Any]) -> list[Any]:
+    """What `work` gives for every item 0 .. count - 1, in their order, the items shared like chunks.
+
+    Args:
+        count: items in all.
+        work: from an item to plain values, those that JSON has.
+
+    Raises:
+        WorkerError: another process of the run is gone.
+    """
+    if workers().count == 1 or count == 0:
+        return [work(i) for i in range(count)]
+
+    def line(cut: slice) -> tuple[Tensor]:
+        text = json.dumps(work(cut.start)) + "\n"
+        return (torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8),)
+
+    text = by_chunks(count, 1, line)[0].numpy().tobytes().decode()
+    return [json.loads(entry) for entry in text.splitlines()]
 
 
 def _gather(own: list[Tensor], crew: Workers, chunks: int) -> Tensor:

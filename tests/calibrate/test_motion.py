@@ -1,5 +1,6 @@
 """Motions and the one warp that undoes them."""
 
+import json
 import math
 
 import pytest
@@ -76,3 +77,11 @@ def test_document_is_plain():
     document = Motion(matrix=shifted(1, 2), model="translation", applied=True).document()
     assert document["matrix"][0] == [1.0, 0.0, 1.0]
     assert document["applied"] is True
+
+
+def test_plain_values_give_the_same_motion():
+    matrix = torch.eye(3, dtype=torch.float64) + 0.1 * torch.rand(3, 3, dtype=torch.float64)
+    motion = Motion(matrix=matrix, model="affine", velocity=(0.1, 1 / 3), sd_px=1e-17, applied=True, reason="so")
+    same = Motion.from_plain(json.loads(json.dumps(motion.plain())))
+    assert torch.equal(same.matrix, motion.matrix)
+    assert {**vars(same), "matrix": None} == {**vars(motion), "matrix": None}

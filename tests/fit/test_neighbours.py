@@ -5,6 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reflectsep.fit import chunks, neighbours
 from reflectsep.fit.neighbours import QUADRATIC, local_median, local_quadratic, neighbourhood, smooth, to_map
 
 
@@ -63,6 +64,25 @@ def test_the_median_is_of_the_neighbours_inside_the_mask_without_the_pixel_itsel
         for i, (y, x) in enumerate(places):
             around = [j for j, (v, u) in enumerate(places) if j != i and abs(v - y) <= radius and abs(u - x) <= radius]
             assert torch.equal(median[i], values[around].median(0).values)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_medians_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, rows):
+    mask = some_mask()
+    values = some_values(mask)
+    whole = local_median(values, mask, 2)
+    monkeypatch.setattr(neighbours, "PIXELS_OF_A_BAND", rows * mask.shape[1])
+    assert torch.equal(local_median(values, mask, 2), whole)
+
+
+def test_quadratics_a_few_pixels_at_a_time_are_those_of_all(monkeypatch):
+    mask = some_mask()
+    values, weight = some_values(mask, 3), some_values(mask)[:, 0] + 0.1
+    whole = local_quadratic(values, weight, mask, 1.0)
+    monkeypatch.setattr(chunks, "AT_ONCE", 7)
+    parts = local_quadratic(values, weight, mask, 1.0)
+    assert torch.equal(parts[0], whole[0])
+    assert torch.equal(parts[1], whole[1])
 
 
 def test_an_outlier_is_replaced_and_a_lone_pixel_keeps_its_value():

@@ -1,5 +1,6 @@
 """Chunks shared among processes: the same numbers as alone, and no process that waits for a dead one."""
 
+import json
 import os
 import socket
 import subprocess
@@ -7,15 +8,17 @@ import sys
 from pathlib import Path
 
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from reflectsep.errors import SaidElsewhereError, WorkerError
-from reflectsep.solve.sharing import by_chunks, shared_work, workers
+from reflectsep.solve.sharing import ALIGNED, SHARES, by_chunks, by_items, cuts_of, shared_work, workers
 
 WORKER = """
-import os, sys
+import json, os, sys
 import torch
 from reflectsep.errors import FitError, ReflectsepError
-from reflectsep.solve.sharing import by_chunks, shared_work, workers
+from reflectsep.solve.sharing import by_chunks, by_items, shared_work, workers
 
 def work(cut):
     assert workers().count == 1  # what is nested is not shared again
@@ -29,6 +32,7 @@ with shared_work() as crew:
         return work(cut)
     pairs, positive, sums = by_chunks(23, 4, watched)
     torch.save({"pairs": pairs, "positive": positive, "sums": sums, "seen": torch.tensor(seen)}, sys.argv[1])
+    print(json.dumps(by_items(5, lambda i: (0.1 + i, f"item {i}\\n", None))))
     few = by_chunks(3, 4, watched)
     assert len(few[0]) == 3
     if sys.argv[2] == "die" and crew.rank == 1:
@@ -77,7 +81,32 @@ def test_alone_chunks_are_joined_in_order():
     everything = torch.arange(23, dtype=torch.float64).sin()
     assert torch.equal(pairs[:, 0], everything)
     assert torch.equal(positive, everything > 0)
-    torch.testing.assert_close(sums, torch.stack([part.sum() for part in everything.split(4)]))
+    torch.testing.assert_close(sums, torch.stack([part.sum() for part in everything.split(3)]))
+
+
+@given(st.integers(1, 200_000), st.integers(1, 5000))
+def test_cuts_cover_the_blocks_and_leave_no_process_waiting(count, chunk):
+    cuts = cuts_of(count, chunk)
+    assert [0, *(cut.stop for cut in cuts)] == [*(cut.start for cut in cuts), count]
+    lengths = {cut.stop - cut.start for cut in cuts[:-1]}
+    assert len(lengths) <= 1
+    assert all(0 < cut.stop - cut.start <= chunk for cut in cuts)
+    if 1 < len(cuts) and count >= SHARES * ALIGNED:
+        assert len(cuts) >= SHARES - 1
+        # The two halves of the chunks, in turn, are alike to two chunks at most.
+        own = [sum(cut.stop - cut.start for cut in cuts[rank::2]) for rank in (0, 1)]
+        assert abs(own[0] - own[1]) <= max(lengths) + max(lengths) - (cuts[-1].stop - cuts[-1].start)
+
+
+def test_a_few_chunks_too_many_become_even_ones():
+    assert [cut.stop - cut.start for cut in cuts_of(8923, 4096)] == [2240, 2240, 2240, 2203]
+    assert cuts_of(4096, 4096) == [slice(0, 4096)]
+    assert [cut.stop for cut in cuts_of(5, 1)] == [1, 2, 3, 4, 5]
+
+
+def test_items_alone_are_what_work_gives():
+    assert by_items(3, lambda i: {"i": i}) == [{"i": 0}, {"i": 1}, {"i": 2}]
+    assert by_items(0, lambda i: i) == []
 
 
 def test_without_other_processes_nothing_is_shared():
@@ -96,16 +125,19 @@ def test_two_processes_give_every_bit_of_one_and_each_does_its_part(tmp_path):
         for result in found:
             assert torch.equal(result[name], alone)
             assert result[name].dtype == alone.dtype
-    assert found[0]["seen"].tolist() == [0, 8, 16]
-    assert found[1]["seen"].tolist() == [4, 12, 20]
+    assert found[0]["seen"].tolist() == [0, 6, 12, 18]
+    assert found[1]["seen"].tolist() == [3, 9, 15, 21]
+    for process in ended:
+        assert json.loads(process.stdout) == [[0.1 + i, f"item {i}\n", None] for i in range(5)]
 
 
 def test_a_process_that_dies_is_an_error_of_the_other(tmp_path):
     survivor, dead = run_two(tmp_path, "die")
     assert dead.returncode == 9
     assert survivor.returncode != 0
-    assert survivor.stdout.startswith(f"{WorkerError.__name__} another process of this run is gone")
-    assert len(survivor.stdout.splitlines()) == 1
+    said = survivor.stdout.splitlines()[1:]  # after the items
+    assert len(said) == 1
+    assert said[0].startswith(f"{WorkerError.__name__} another process of this run is gone")
 
 
 def test_an_error_of_all_is_said_by_one(tmp_path):
