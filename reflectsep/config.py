@@ -2,7 +2,7 @@
 
 Each field is made by `setting`, which holds its help text and its bounds; a `Literal` type lists its choices. From
 these come the structured configs that Hydra checks overrides against (`reflectsep.cli.overrides`) and the help of the
-command. Settings are not frozen. A job is what the function `run_*` of `reflectsep.pipeline` of its name takes.
+command. Settings are not frozen. A job is what the function `run_*` of `reflectsep.jobs` of its name takes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The command line: exit codes, one line an error, several runs; the pipeline is a stand-in."""
+"""The command line: exit codes, one line an error, several runs; the jobs are a stand-in."""
 
 import os
 import subprocess
@@ -34,29 +34,29 @@ def run(job, progress):
     return "wrote " + job.out
 
 
-pipeline = ModuleType("reflectsep.pipeline")
-pipeline.run_simulate = pipeline.run_fit = run
-sys.modules["reflectsep.pipeline"] = pipeline
+jobs = ModuleType("reflectsep.jobs")
+jobs.run_simulate = jobs.run_fit = run
+sys.modules["reflectsep.jobs"] = jobs
 """
 
 
 @pytest.fixture
 def ran(monkeypatch, tmp_path):
     """Jobs that ran, in a folder of their own."""
-    jobs = []
+    done = []
 
     def run(job, progress):
         progress("stage", 1, 1)
-        jobs.append(job)
+        done.append(job)
         return "done"
 
-    pipeline = ModuleType("reflectsep.pipeline")
+    jobs = ModuleType("reflectsep.jobs")
     for name in JOBS:
-        setattr(pipeline, f"run_{name}", run)
-    monkeypatch.setitem(sys.modules, "reflectsep.pipeline", pipeline)
-    monkeypatch.setattr(reflectsep, "pipeline", pipeline, raising=False)
+        setattr(jobs, f"run_{name}", run)
+    monkeypatch.setitem(sys.modules, "reflectsep.jobs", jobs)
+    monkeypatch.setattr(reflectsep, "jobs", jobs, raising=False)
     monkeypatch.chdir(tmp_path)
-    return jobs
+    return done
 
 
 def fails(capsys, words, code):
@@ -178,7 +178,7 @@ def test_foreseen_errors_of_a_job_are_one_line(ran, capsys, monkeypatch, error):
     def run(_job, _progress):
         raise error
 
-    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    monkeypatch.setattr(reflectsep.jobs, "run_fit", run)
     assert fails(capsys, ["fit", "capture=c"], 1) == " ".join(str(error).split())
 
 
@@ -186,7 +186,7 @@ def test_a_bug_keeps_its_traceback(ran, monkeypatch):
     def run(_job, _progress):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    monkeypatch.setattr(reflectsep.jobs, "run_fit", run)
     with pytest.raises(ZeroDivisionError):
         main(["fit", "capture=c"])
     with pytest.raises(ZeroDivisionError):
@@ -198,7 +198,7 @@ def test_interruption_is_one_line(ran, capsys, monkeypatch, words):
     def run(_job, _progress):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    monkeypatch.setattr(reflectsep.jobs, "run_fit", run)
     assert main(words) == 130
     assert capsys.readouterr().err.split("\n") == ["", "reflectsep: interrupted", ""]
 
@@ -209,14 +209,14 @@ def test_a_run_that_fails_stops_no_other(ran, capsys, monkeypatch):
             raise CaptureError("captures/wax: melted")
         ran.append(job)
 
-    monkeypatch.setattr(reflectsep.pipeline, "run_fit", run)
+    monkeypatch.setattr(reflectsep.jobs, "run_fit", run)
     assert fails(capsys, ["fit", "-m", "object=wax,pudding"], 1) == "object=wax: captures/wax: melted"
     assert [job.object.name for job in ran] == ["pudding"]
 
 
 @pytest.fixture
 def command(tmp_path):
-    """Runs the command in a process of its own (as do its worker processes) with the stand-in for a pipeline."""
+    """Runs the command in a process of its own (as do its worker processes) with the stand-in for the jobs."""
     hook = tmp_path / "hook"
     hook.mkdir()
     (hook / "sitecustomize.py").write_text(STAND_IN)

@@ -9,7 +9,7 @@ import pytest
 from reflectsep.config import ObjectSettings, RigSettings, SimulateJob
 from reflectsep.io.capture import load_capture
 from reflectsep.io.frames import open_sweep
-from reflectsep.pipeline import run_simulate
+from reflectsep.jobs import run_simulate
 
 PNG = b"\x89PNG"
 

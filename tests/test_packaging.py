@@ -73,7 +73,7 @@ def test_public_names_lead_to_what_they_name():
     assert reflectsep.load is pipeline.load
     assert reflectsep.load_capture is pipeline.load_capture
     assert reflectsep.Separation is import_module("reflectsep.separation").Separation
-    assert all(callable(getattr(pipeline, f"run_{job}")) for job in JOBS)
+    assert all(callable(getattr(import_module("reflectsep.jobs"), f"run_{job}")) for job in JOBS)
 
 
 @pytest.mark.parametrize("job", JOBS)
@@ -83,7 +83,7 @@ def test_scripts_are_the_jobs(job):
 
 
 def test_there_is_one_script_a_job():
-    measuring = ("benchmark", "scaling", "sweep_speed")
+    measuring = ("benchmark", "scaling", "sweep_speed", "time_left")
     assert sorted(path.stem for path in (ROOT / "scripts").glob("*.py")) == sorted([*JOBS, *measuring])
     assert sorted(path.stem for path in (ROOT / "configs").glob("*.yaml")) == sorted(f"{job}_job" for job in JOBS)
 

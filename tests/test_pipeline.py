@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import reflectsep
-from reflectsep import pipeline
+from reflectsep import jobs, pipeline, recorded
 from reflectsep.comparison import bounded
 from reflectsep.config import (
     CompareJob,
@@ -28,9 +28,11 @@ from reflectsep.config import (
     SimulateJob,
 )
 from reflectsep.errors import LightError, ResultError, SettingsError
+from reflectsep.estimate import TimeLeft
 from reflectsep.fit import reflectance
 from reflectsep.io.exr import read_channels
 from reflectsep.io.pictures import read_picture
+from reflectsep.summary import summary
 
 QUICK = FitSettings(tolerance=1e-2, max_iterations=2, globals_pixels=40, lobe="single", scattering_sd=0.0)
 RIG = RigSettings(slab_width_px=8.0, slab_step_px=4.0, lights=7, sweeps=3, heldout=2)
@@ -55,7 +57,7 @@ def folder(tmp_path_factory):
 def captured(folder):
     """A capture of seven pictures and three sweeps."""
     out = folder / "capture"
-    pipeline.run_simulate(SimulateJob(object=ObjectSettings(name="wax", size_px=28), rig=RIG, out=str(out)))
+    jobs.run_simulate(SimulateJob(object=ObjectSettings(name="wax", size_px=28), rig=RIG, out=str(out)))
     return out
 
 
@@ -66,10 +68,28 @@ def seen():
 
 
 @pytest.fixture(scope="module")
-def said(folder, captured, seen):
+def unforeseen():
+    """Stages of the fit that no announcement had named."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def said(folder, captured, seen, unforeseen):
     """What the fit says; its result, without light L7, is beside the capture."""
     job = FitJob(capture=str(captured), out=str(folder / "result"), fit=QUICK, heldout=["L7"])
-    return pipeline.run_fit(job, lambda stage, done, total: seen.setdefault(stage, []).append((done, total)))
+
+    class Watch:
+        left = TimeLeft()
+
+        def expect(self, parts):
+            self.left.expect(parts)
+
+        def __call__(self, stage, done, total):
+            seen.setdefault(stage, []).append((done, total))
+            if not self.left(stage, done, total).expected_s:
+                unforeseen.append(stage)
+
+    return jobs.run_fit(job, Watch())
 
 
 @pytest.fixture(scope="module")
@@ -104,15 +124,15 @@ def test_a_fit_leaves_a_report_unless_told_not_to(result, said):
 def test_the_report_has_lin_and_lee_beside_where_that_is_quick_or_asked_for(result, captured, monkeypatch):
     job = FitJob(capture=str(captured), out=str(result) + "_again")
     capture = reflectsep.load_capture(captured)
-    assert pipeline.wants_baseline(job, capture)
+    assert jobs.wants_baseline(job, capture)
     assert "Lin &amp; Lee" in (result / "report.html").read_text()
-    assert not pipeline.wants_baseline(dataclasses.replace(job, report=False), capture)
-    assert not pipeline.wants_baseline(dataclasses.replace(job, baseline=False), capture)
+    assert not jobs.wants_baseline(dataclasses.replace(job, report=False), capture)
+    assert not jobs.wants_baseline(dataclasses.replace(job, baseline=False), capture)
     lin_lee = dataclasses.replace(job, fit=FitSettings(scattering="none"))
-    assert not pipeline.wants_baseline(lin_lee, capture)
-    monkeypatch.setattr(pipeline, "QUICK_S", 0.0)
-    assert not pipeline.wants_baseline(job, capture)
-    assert pipeline.wants_baseline(dataclasses.replace(job, baseline=True), capture)
+    assert not jobs.wants_baseline(lin_lee, capture)
+    monkeypatch.setattr(jobs, "QUICK_S", 0.0)
+    assert not jobs.wants_baseline(job, capture)
+    assert jobs.wants_baseline(dataclasses.replace(job, baseline=True), capture)
 
 
 def test_document_says_how_it_came_about(result, captured):
@@ -143,7 +163,7 @@ def test_components_add_up_to_the_picture(result, captured):
 
 def test_relit_pictures_of_the_command_are_those_of_python(result, captured, tmp_path):
     out = tmp_path / "relit"
-    said = pipeline.run_relight(RelightJob(result=str(result), alpha=[0.2, 0.3, 0.5], intensity=2.0, out=str(out)))
+    said = jobs.run_relight(RelightJob(result=str(result), alpha=[0.2, 0.3, 0.5], intensity=2.0, out=str(out)))
     assert said == f"{out}: 1 picture"
     (plane,) = read_channels(out / "relit.exr").values()
     expected = reflectsep.load(result).relight(torch.tensor([0.4, 0.6, 1.0]))
@@ -154,22 +174,22 @@ def test_a_basis_light_by_direction_is_its_alpha(result, captured, tmp_path):
     light = reflectsep.load_capture(captured).lights["L2"]
     job = RelightJob(result=str(result), direction=list(light.direction), out=str(tmp_path / "relit"))
     separation = reflectsep.load(result)
-    (mix,) = pipeline.mixes(job, separation).values()
+    (mix,) = jobs.mixes(job, separation).values()
     torch.testing.assert_close(torch.tensor(mix.alpha), torch.tensor([0.0, 1.0, 0.0]), rtol=0, atol=1e-5)
 
 
 def test_lights_of_a_file_and_of_an_orbit_are_written_by_name(result, captured, tmp_path):
     lights = RelightJob(result=str(result), lights=str(captured / "heldout.json"), out=str(tmp_path / "a"))
-    pipeline.run_relight(lights)
+    jobs.run_relight(lights)
     names = set(json.loads((captured / "heldout.json").read_text())["lights"])
     assert {path.stem for path in (tmp_path / "a").glob("*.exr")} == names
-    pipeline.run_relight(RelightJob(result=str(result), orbit=3, out=str(tmp_path / "b")))
+    jobs.run_relight(RelightJob(result=str(result), orbit=3, out=str(tmp_path / "b")))
     assert len(list((tmp_path / "b").glob("*.exr"))) == 3
 
 
 def test_comparison_has_the_held_out_lights_and_the_truth(result, tmp_path):
     out = tmp_path / "figure.png"
-    said = pipeline.run_compare(CompareJob(result=str(result), out=str(out)))
+    said = jobs.run_compare(CompareJob(result=str(result), out=str(out)))
     assert out.read_bytes().startswith(b"\x89PNG")
     lines = said.splitlines()
     assert [line.split()[0] for line in lines[1:5]] == ["L7", "L8", "L9", "L10"]
@@ -181,9 +201,9 @@ def test_comparison_has_the_held_out_lights_and_the_truth(result, tmp_path):
 def test_result_without_scattering_is_compared_as_lin_lees_own(result, captured, tmp_path, monkeypatch):
     bare = dataclasses.replace(reflectsep.load(result), s=torch.zeros_like(reflectsep.load(result).s))
     bare.save(tmp_path / "bare")
-    monkeypatch.setattr(pipeline, "fit", None)  # it takes no other fit
+    monkeypatch.setattr(recorded, "fit", None)  # it takes no other fit
     out = tmp_path / "figure.png"
-    said = pipeline.run_compare(CompareJob(result=str(tmp_path / "bare"), capture=str(captured), out=str(out)))
+    said = jobs.run_compare(CompareJob(result=str(tmp_path / "bare"), capture=str(captured), out=str(out)))
     (line,) = [line for line in said.splitlines() if line.strip().startswith("L7 ")]
     assert "Lin & Lee" in line
     assert "ours" not in line
@@ -200,18 +220,46 @@ def test_overflowing_picture_is_bounded_and_others_are_left_as_they_are():
 def test_comparison_needs_the_capture(result, tmp_path):
     separation = dataclasses.replace(reflectsep.load(result), document={"capture": str(tmp_path / "gone")})
     with pytest.raises(ResultError, match=r"its capture '.*gone' is not there; give capture=FOLDER"):
-        pipeline.recorded_capture(separation, "result")
+        recorded.recorded_capture(separation, "result")
     with pytest.raises(ResultError, match=r"result: separation.json has no usable settings.fit"):
-        pipeline.recorded_settings(separation, "result")
+        recorded.recorded_settings(separation, "result")
+
+
+def test_lin_and_lee_beside_is_moved_as_the_result_was(result, captured, monkeypatch):
+    separation = reflectsep.load(result)
+    document = json.loads(json.dumps(separation.document["alignment"]))
+    moved = next(iter(set(document["pictures"]) - {separation.basis[0]}))
+    document["pictures"][moved] |= {"applied": True, "reason": "told", "matrix": [[1, 0, 12], [0, 1, 0], [0, 0, 1]]}
+    told = dataclasses.replace(separation, document={**separation.document, "alignment": document})
+    monkeypatch.setattr(pipeline, "align", None)  # it does not look again
+    beside = recorded.lin_lee_beside(told, reflectsep.load_capture(captured), QUICK, lambda *_: None)
+    assert beside.document["alignment"] == document
+    assert 0 < beside.mask.sum() < separation.mask.sum()  # what came from outside is none of it
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"size": None},
+        {"size": [28, 28], "pictures": [], "sweeps": [{}]},
+        {"size": [28, 28], "pictures": {"L1": {"matrix": [[1, 0], [0, 1]]}}, "sweeps": []},
+        {"size": [28, 28], "pictures": 3, "sweeps": []},
+        [1],
+    ],
+)
+def test_alignment_that_a_result_cannot_have(result, broken):
+    separation = dataclasses.replace(reflectsep.load(result), document={"capture": "there", "alignment": broken})
+    with pytest.raises(ResultError, match=r"there: its result has no usable alignment"):
+        recorded.recorded_alignment(separation)
 
 
 def test_damaged_result_is_refused_in_one_line(result, tmp_path):
     copy = shutil.copytree(result, tmp_path / "copy")
     (copy / "specular.exr").write_bytes((copy / "specular.exr").read_bytes()[:-50])
     for job, run in (
-        (RelightJob(result=str(copy), orbit=3, out=str(tmp_path / "relit")), pipeline.run_relight),
-        (CompareJob(result=str(copy), out=str(tmp_path / "figure.png")), pipeline.run_compare),
-        (InfoJob(path=str(copy)), pipeline.run_info),
+        (RelightJob(result=str(copy), orbit=3, out=str(tmp_path / "relit")), jobs.run_relight),
+        (CompareJob(result=str(copy), out=str(tmp_path / "figure.png")), jobs.run_compare),
+        (InfoJob(path=str(copy)), jobs.run_info),
     ):
         with pytest.raises(ResultError, match=r"copy/specular\.exr") as caught:
             run(job)
@@ -220,11 +268,11 @@ def test_damaged_result_is_refused_in_one_line(result, tmp_path):
 
 
 def test_info_tells_of_both(result, captured):
-    of_capture = pipeline.run_info(InfoJob(path=str(captured)))
+    of_capture = jobs.run_info(InfoJob(path=str(captured)))
     assert "28 x 28" in of_capture
     assert "7 (7 with a known light direction)" in of_capture
     assert of_capture.count("frames, slab") == 3
-    of_result = pipeline.run_info(InfoJob(path=str(result)))
+    of_result = jobs.run_info(InfoJob(path=str(result)))
     assert "lights    L1, L2, L3, L4, L5, L6; basis L1, L2, L3" in of_result
     assert "C 2.0" in of_result
 
@@ -236,7 +284,7 @@ def test_without_sweeps_the_fit_is_lin_and_lee_and_says_so(captured):
     assert any("no sweeps" in warning for warning in separation.document["warnings"])
     assert separation.document["settings"]["fit"]["method"] == "two_step"
     assert not separation.scattering.any()
-    assert "no sweeps" in pipeline.summary(separation)
+    assert "no sweeps" in summary(separation)
 
 
 def test_settings_by_keyword_are_checked(captured):
@@ -262,11 +310,15 @@ def test_plain_folder_of_pictures_fits(captured, tmp_path):
         shutil.copy(captured / "full" / f"{name}.exr", plain / f"{name}.exr")
         rows.append(f"{name}.exr " + " ".join(f"{x:.6f}" for x in capture.lights[name].direction))
     (plain / "lights.lp").write_text("\n".join(rows) + "\n")
-    said = pipeline.run_fit(FitJob(capture=str(plain), out=str(tmp_path / "result"), fit=QUICK, report=False))
+    said = jobs.run_fit(FitJob(capture=str(plain), out=str(tmp_path / "result"), fit=QUICK, report=False))
     assert "Lin & Lee" in said
     separation = reflectsep.load(tmp_path / "result")
     assert len(separation.names) == 7
     assert separation.document["residual"]["rms"] < 0.05
+
+
+def test_every_stage_was_announced_with_its_time(said, unforeseen):
+    assert unforeseen == []
 
 
 def test_progress_of_every_stage_ends(said, seen):
@@ -280,8 +332,8 @@ def test_progress_of_every_stage_ends(said, seen):
 def test_colour(tmp_path):
     out = tmp_path / "colour"
     item = ObjectSettings(name="skin", preset="skin", size_px=20, channels=3)
-    pipeline.run_simulate(SimulateJob(object=item, rig=RIG, out=str(out)))
-    pipeline.run_fit(FitJob(capture=str(out), out=str(tmp_path / "result"), fit=QUICK, report=False))
+    jobs.run_simulate(SimulateJob(object=item, rig=RIG, out=str(out)))
+    jobs.run_fit(FitJob(capture=str(out), out=str(tmp_path / "result"), fit=QUICK, report=False))
     separation = reflectsep.load(tmp_path / "result")
     assert separation.scattering.shape == (3, 3, 20, 20)
     assert separation.relight(torch.eye(3)).shape == (3, 3, 20, 20)
@@ -291,7 +343,7 @@ def test_colour(tmp_path):
 def test_demo_leaves_a_figure_and_relit_pictures(tmp_path):
     out = tmp_path / "demo"
     job = DemoJob(object=ObjectSettings(name="wax", size_px=28), rig=RIG, fit=QUICK, out=str(out))
-    said = pipeline.run_demo(job)
+    said = jobs.run_demo(job)
     assert f"look at {out / 'compare.png'}" in said
     assert {path.name for path in out.iterdir()} == {"capture", "result", "relit", "compare.png"}
     assert len(list((out / "relit").glob("*.exr"))) == 3

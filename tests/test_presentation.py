@@ -9,7 +9,7 @@ import torch
 
 from reflectsep.config import RelightJob
 from reflectsep.errors import ResultError
-from reflectsep.pipeline import mixes, run_relight
+from reflectsep.jobs import mixes, run_relight
 from reflectsep.report.tone import tone, tone_16, white_point
 from reflectsep.separation import load
 

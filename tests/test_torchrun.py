@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from reflectsep.config import ObjectSettings, SimulateJob
-from reflectsep.pipeline import run_simulate
+from reflectsep.jobs import run_simulate
 from reflectsep.separation import load
 
 pytestmark = pytest.mark.slow

@@ -65,6 +65,22 @@ class Alignment:
             ],
         }
 
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Alignment:
+        """What `document` gave, without its warnings.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is none.
+        """
+        size = document["size"]
+        sweeps = [dict(sweep) for sweep in document["sweeps"]]
+        return cls(
+            pictures={str(name): Motion.from_document(motion) for name, motion in dict(document["pictures"]).items()},
+            sweeps=tuple(Motion.from_document(sweep) for sweep in sweeps),
+            against_full=tuple(Motion.from_document(sweep["against_full"]) for sweep in sweeps),
+            size=None if size is None else (int(size[0]), int(size[1])),
+        )
+
 
 def align(
     capture: Capture,

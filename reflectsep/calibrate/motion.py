@@ -9,6 +9,7 @@ sweep. Motions are composed as matrices, so that a picture is resampled once how
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -88,6 +89,27 @@ class Motion:
             "applied": self.applied,
             "reason": self.reason,
         }
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any]) -> Motion:
+        """What `document` gave.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is none.
+        """
+        numbers = {name: float(document[name]) for name in ("displacement_px", "sd_px", "trust", "gain")}
+        x, y = (float(value) for value in document["velocity_px"])
+        matrix = torch.tensor(document["matrix"], dtype=torch.float64)
+        if matrix.shape != (3, 3) or not matrix.isfinite().all() or not all(map(math.isfinite, (x, y))):
+            raise ValueError(f"a motion of matrix {matrix.tolist()} and velocity {(x, y)}; finite ones were expected")
+        return cls(
+            matrix=matrix,
+            velocity=(x, y),
+            model=str(document["model"]),
+            applied=bool(document["applied"]),
+            reason=str(document["reason"]),
+            **numbers,
+        )
 
 
 def shifted(dx: float, dy: float, degrees: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)) -> Tensor:

@@ -2,7 +2,7 @@
 
 Exit codes: 0 done, 1 the data or the fit failed or a check found something bad, 2 the settings or the usage are wrong,
 130 interrupted.
-Hydra and the pipeline are imported where they are used, so that `--help` answers at once.
+Hydra and the jobs are imported where they are used, so that `--help` answers at once.
 """
 
 from __future__ import annotations

@@ -104,10 +104,10 @@ def _task(job: str, keys: frozenset[str], lines: bool, config: DictConfig) -> in
 
 
 def _run(job: str, settings: Job, where: str = "", *, parallel: bool = False, lines: bool = False) -> int:
-    from reflectsep import pipeline
+    from reflectsep import jobs
 
     with _crew(job) as first:
-        run = getattr(pipeline, f"run_{job}")
+        run = getattr(jobs, f"run_{job}")
         if not first:  # another process of this run shows what is done, and writes it
             run(settings, silent)
             return 0

@@ -7,7 +7,7 @@ import shutil
 import pytest
 import torch
 
-from reflectsep import pipeline
+from reflectsep import jobs
 from reflectsep.calibrate.chrome import Circle, disc, sphere_normals
 from reflectsep.calibrate.exposure import response_of
 from reflectsep.checking.check import check_capture
@@ -19,13 +19,14 @@ from reflectsep.errors import CaptureError, ResultError, SettingsError
 from reflectsep.io.calibration import read_calibration
 from reflectsep.io.capture import load_capture
 from reflectsep.io.pictures import write_picture
+from reflectsep.pipeline import with_calibration
 
 RIG = {"slab_width_px": 8.0, "slab_step_px": 4.0, "heldout": 0, "bits": 12, "read_noise": 0.0005}
 
 
 def simulated(folder, name="wax", size=40, **rig):
     item = ObjectSettings(name=name, preset=name, size_px=size)
-    pipeline.run_simulate(SimulateJob(object=item, rig=RigSettings(**{**RIG, **rig}), out=str(folder)))
+    jobs.run_simulate(SimulateJob(object=item, rig=RigSettings(**{**RIG, **rig}), out=str(folder)))
     return folder
 
 
@@ -151,7 +152,7 @@ def test_command_writes_a_sheet_and_json_and_an_exit_code(good, tmp_path, capsys
     assert document["alignment"]["reference"] == "L1"
     assert sheet.read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ResultError, match=r"sheet\.png"):
-        pipeline.run_check(CheckJob(capture=str(good), sheet=str(sheet)))
+        jobs.run_check(CheckJob(capture=str(good), sheet=str(sheet)))
 
 
 def test_command_ends_with_1_where_something_is_bad(tmp_path, capsys):
@@ -182,7 +183,7 @@ def test_calibrate_writes_what_a_fit_reads(good, tmp_path):
     job = CalibrateJob(
         capture=str(folder), chrome=str(tmp_path / "chrome"), intensity="sphere", matte=str(tmp_path / "matte")
     )
-    said = pipeline.run_calibrate(job)
+    said = jobs.run_calibrate(job)
     assert "ball and list" in said
     assert "intensity against the list's" in said
     found = read_calibration(folder / "calibration.json")
@@ -191,17 +192,17 @@ def test_calibrate_writes_what_a_fit_reads(good, tmp_path):
             torch.tensor(found.lights[name].direction), torch.tensor(capture.lights[name].direction), rtol=0, atol=6e-3
         )
         assert found.lights[name].intensity[0] == pytest.approx(1.0, rel=0.02)
-    used, file = pipeline.with_calibration(load_capture(folder), None)
+    used, file = with_calibration(load_capture(folder), None)
     assert file == str(folder / "calibration.json")
     assert used.lights["L2"] == found.lights["L2"]
-    assert pipeline.with_calibration(capture, None) == (capture, None)
+    assert with_calibration(capture, None) == (capture, None)
     with pytest.raises(ResultError, match=r"calibration\.json"):
-        pipeline.run_calibrate(job)
+        jobs.run_calibrate(job)
 
 
 def test_strengths_jointly_from_pictures(good, tmp_path):
     out = tmp_path / "calibration.json"
-    said = pipeline.run_calibrate(CalibrateJob(capture=str(good), intensity="pictures", out=str(out)))
+    said = jobs.run_calibrate(CalibrateJob(capture=str(good), intensity="pictures", out=str(out)))
     assert "strengths jointly from the pictures" in said
     strengths = [light.intensity[0] for light in read_calibration(out).lights.values()]
     assert strengths == pytest.approx([1.0] * len(strengths), rel=0.05)
@@ -219,15 +220,15 @@ def test_response_from_a_bracket_is_used(good, tmp_path):
         write_picture(folder / file, ((scene * 0.05 * 2**power).clamp(max=1) ** (1 / 2.2))[None], bits=8)
         document["images"].append({"kind": "full", "light": "L6", "file": file, "exposure_s": 0.01 * 2**power})
     (folder / "capture.json").write_text(json.dumps(document))
-    said = pipeline.run_calibrate(CalibrateJob(capture=str(folder), response="debevec"))
+    said = jobs.run_calibrate(CalibrateJob(capture=str(folder), response="debevec"))
     assert "7 exposures of L6" in said
-    used, _ = pipeline.with_calibration(load_capture(folder), None)
+    used, _ = with_calibration(load_capture(folder), None)
     linear = response_of(used)(torch.tensor([0.3, 0.6, 0.9]))
     torch.testing.assert_close(linear, torch.tensor([0.3, 0.6, 0.9]) ** 2.2, rtol=0, atol=0.01)
 
 
 def test_calibrate_refuses_to_do_nothing(good):
     with pytest.raises(SettingsError, match="nothing to do; give chrome=FOLDER"):
-        pipeline.run_calibrate(CalibrateJob(capture=str(good), out="never.json"))
+        jobs.run_calibrate(CalibrateJob(capture=str(good), out="never.json"))
     with pytest.raises(CaptureError, match="no light has several exposures"):
-        pipeline.run_calibrate(CalibrateJob(capture=str(good), response="debevec", out="never.json"))
+        jobs.run_calibrate(CalibrateJob(capture=str(good), response="debevec", out="never.json"))

@@ -20,7 +20,7 @@ from reflectsep.export.lights import cap, mixes, screen_picture
 from reflectsep.export.textures import rendered, textures_of
 from reflectsep.io.exr import read_channels
 from reflectsep.io.rti import write_ptm
-from reflectsep.pipeline import run_export
+from reflectsep.jobs import run_export
 from reflectsep.report.tone import white_point
 
 

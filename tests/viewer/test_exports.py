@@ -11,7 +11,7 @@ import pytest
 
 from reflectsep.config import ExportJob
 from reflectsep.export.lights import cap, mixes, screen_picture
-from reflectsep.pipeline import run_export
+from reflectsep.jobs import run_export
 from reflectsep.report.tone import white_point
 from reflectsep.separation import load
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from reflectsep.config import RelightJob
-from reflectsep.pipeline import mixes, run_relight
+from reflectsep.jobs import mixes, run_relight
 from reflectsep.report.tone import tone, white_point
 
 from .conftest import decoded

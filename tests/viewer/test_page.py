@@ -12,7 +12,7 @@ import torch
 from reflectsep.config import ViewJob
 from reflectsep.errors import ResultError, SettingsError
 from reflectsep.flags import WORDS, Flag
-from reflectsep.pipeline import run_view
+from reflectsep.jobs import run_view
 from reflectsep.viewer.page import Shown, safe_json, write_page
 
 
