@@ -13,7 +13,7 @@ model it goes on below zero beyond the edge of an attached shadow, so there too 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -29,9 +29,13 @@ from reflectsep.errors import ResultError
 from reflectsep.flags import count
 from reflectsep.io.result import read_result, write_result
 from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_power, reflectance
+from reflectsep.room import empty, stacked
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
 LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
+MAPS = (*COMPONENTS, "mask", "flags", "d", "s", "B", "d_sd", "s_sd", "B_sd", "residual")
+PIXELS_AT_ONCE = 1 << 18
+"""Of which components are made."""
 GREY, COLOUR = ("Y",), ("R", "G", "B")
 
 
@@ -109,6 +113,11 @@ class Separation:
         pictures = pictures.permute(3, 2, 0, 1) * intensity[:, None, None, None] * self.mask
         return pictures.reshape(*lead, *pictures.shape[1:])
 
+    def rows(self, rows: slice) -> Separation:
+        """The same of some of the picture's rows; it shares their memory."""
+        maps = {name: value[..., rows, :] for name, value in vars(self).items() if name in MAPS}
+        return replace(self, **maps)
+
     def unit_mix(self, alpha: Float[Tensor, "lights 3"]) -> tuple[Float[Tensor, "lights 3"], Float[Tensor, "lights"]]:
         """Alpha among basis lights of unit intensity for a light of unit intensity, and the light's intensity."""
         if self.light_vectors is None:
@@ -125,7 +134,7 @@ class Separation:
             ResultError: `out` exists and `overwrite` is false, or it is no result.
         """
         channels = GREY if self.d.shape[1] == 1 else COLOUR
-        layers: dict[str, dict[str, np.ndarray]] = {}
+        layers: dict[str, Mapping[str, np.ndarray]] = {}
         for name in COMPONENTS:
             layers[f"{name}.exr"] = picture_channels(self.basis, getattr(self, name), channels)
         layers["residual.exr"] = picture_channels(self.names, self.residual, channels)
@@ -172,7 +181,7 @@ class Separation:
 def picture_channels(names: tuple[str, ...], stack: Tensor, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
     """`stack` (names, channels, height, width) as planes `NAME.R` or `NAME.Y`."""
     return {
-        f"{name}.{c}": np.ascontiguousarray(stack[i, j].detach().cpu().numpy().astype(np.float32))
+        f"{name}.{c}": np.ascontiguousarray(stack[i, j].detach().cpu().numpy(), np.float32)
         for i, name in enumerate(names)
         for j, c in enumerate(channels)
     }
@@ -182,13 +191,10 @@ def separate(
     stack: PhotometricStack, scattering: Scattering | None, fit: Fit, document: Mapping[str, Any]
 ) -> Separation:
     """Components of every basis light from the fitted parameters."""
-    s_sd = torch.zeros_like(fit.d)
-    measured = fit.s[:3]
-    if scattering is not None:
-        if scattering.root_sd is not None:
-            s_sd = scattering.root_sd[:3].float() * stack.mask
-        intensity_root = fit.intensity[:3, None, None, None] ** (1.0 / float(fit.n_d))
-        measured = scattering.root[:3].float() / intensity_root
+    nothing = fit.d.new_zeros(()).expand_as(fit.d)  # in the memory of one value
+    s_sd = nothing
+    if scattering is not None and scattering.root_sd is not None:
+        s_sd = stacked((picture.float() * stack.mask for picture in scattering.root_sd[:3]), 3)
     alpha, vectors = stack.alpha.float(), None if stack.light_vectors is None else stack.light_vectors.float()
     if fit.alpha is not None:
         alpha = fit.alpha
@@ -211,33 +217,53 @@ def separate(
         d_sd=fit.d_sd,
         s_sd=s_sd,
         B_sd=fit.B_sd,
-        specular=torch.zeros_like(fit.d),
-        local_diffuse=torch.zeros_like(fit.d),
-        scattering=torch.zeros_like(fit.d),
-        diffuse=torch.zeros_like(fit.d),
-        highlight_free=torch.zeros_like(fit.d),
+        specular=nothing,
+        local_diffuse=nothing,
+        scattering=nothing,
+        diffuse=nothing,
+        highlight_free=nothing,
         residual=fit.residual,
         document=document,
     )
+    intensity_root = fit.intensity[:3, None, None, None] ** (1.0 / float(fit.n_d))
+
+    def measured(rows: slice) -> Tensor:
+        if scattering is None:
+            return separation.s[:, :, rows]
+        return scattering.root[:3, :, rows].float() / intensity_root
+
     return with_components(separation, stack, measured)
 
 
-def with_components(separation: Separation, stack: PhotometricStack, measured: Tensor) -> Separation:
-    """`separation` with its components filled in; `measured` is s_k as the sweeps gave it."""
-    t = separation.intensity[:, None, None, None]
-    d, B = separation.d.permute(2, 3, 1, 0), separation.B.mean(0)
-    u = lobe_argument(d, B, separation.a, torch.eye(3)).permute(2, 0, 1)[:, None]
-    specular = (t * lobe(u, separation.n_s, separation.haze) * stack.mask).expand_as(separation.d)
-    diffuse = separation.relight(torch.eye(3)) - specular
-    unknown = stack.saturated[:3] | ~stack.images[:3].isfinite() | ~stack.mask
-    return replace(
-        separation,
-        specular=specular.contiguous(),
-        local_diffuse=t * positive_power(separation.d, separation.n_d),
-        scattering=t * positive_power(measured, separation.n_d) * stack.mask,
-        diffuse=diffuse,
-        highlight_free=torch.where(unknown, diffuse, stack.images[:3].float() - specular),
-    )
+def with_components(separation: Separation, stack: PhotometricStack, measured: Callable[[slice], Tensor]) -> Separation:
+    """`separation` with its components filled in; `measured` gives rows of s_k as the sweeps had it."""
+    found = {name: empty(*separation.d.shape, dtype=separation.d.dtype) for name in COMPONENTS}
+    height, width = separation.mask.shape
+    band = max(1, PIXELS_AT_ONCE // width)
+    for top in range(0, height, band):
+        band_rows = slice(top, min(top + band, height))
+        for name, values in _components(separation, stack, measured(band_rows), band_rows).items():
+            found[name][..., band_rows, :] = values
+    return replace(separation, **found)
+
+
+def _components(separation: Separation, stack: PhotometricStack, measured: Tensor, rows: slice) -> dict[str, Tensor]:
+    """Components of some of the picture's rows."""
+    part = separation.rows(rows)
+    t = part.intensity[:, None, None, None]
+    d, B = part.d.permute(2, 3, 1, 0), part.B.mean(0)
+    u = lobe_argument(d, B, part.a, torch.eye(3)).permute(2, 0, 1)[:, None]
+    specular = (t * lobe(u, part.n_s, part.haze) * part.mask).expand_as(part.d)
+    diffuse = part.relight(torch.eye(3)) - specular
+    pictures = stack.images[:3, :, rows]
+    unknown = stack.saturated[:3, :, rows] | ~pictures.isfinite() | ~part.mask
+    return {
+        "specular": specular,
+        "local_diffuse": t * positive_power(part.d, part.n_d),
+        "scattering": t * positive_power(measured, part.n_d) * part.mask,
+        "diffuse": diffuse,
+        "highlight_free": torch.where(unknown, diffuse, pictures.float() - specular),
+    }
 
 
 def extensions(softness: float, haze: float) -> str:

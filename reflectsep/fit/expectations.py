@@ -54,6 +54,16 @@ VISIBLE = 3.0
 """A lobe counts as seen where it exceeds this many standard deviations of the noise."""
 
 
+def quantile(values: Float[Tensor, "pixels"], share: float) -> float:
+    """The value that `share` of the others stay below, interpolated; torch's own takes 16 million values at most."""
+    rank = share * (len(values) - 1)
+    low = int(rank)
+    below = values.kthvalue(low + 1).values
+    if low == rank:
+        return float(below)
+    return float(torch.lerp(below, values.kthvalue(low + 2).values, rank - low))
+
+
 def near_maximum(values: Float[Tensor, "pixels"]) -> float:
     """The 99.9 % quantile, of some hundred thousand of the pixels at most."""
     return float(torch.quantile(values[:: max(1, len(values) // 100_000)], 0.999))

@@ -71,7 +71,7 @@ def test_medians_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, ro
     mask = some_mask()
     values = some_values(mask)
     whole = local_median(values, mask, 2)
-    monkeypatch.setattr(neighbours, "PIXELS_OF_A_BAND", rows * mask.shape[1])
+    monkeypatch.setattr(neighbours, "PIXELS_OF_WINDOWS", rows * mask.shape[1])
     assert torch.equal(local_median(values, mask, 2), whole)
 
 

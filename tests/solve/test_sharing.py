@@ -91,7 +91,7 @@ def test_cuts_cover_the_blocks_and_leave_no_process_waiting(count, chunk):
     lengths = {cut.stop - cut.start for cut in cuts[:-1]}
     assert len(lengths) <= 1
     assert all(0 < cut.stop - cut.start <= chunk for cut in cuts)
-    if 1 < len(cuts) and count >= SHARES * ALIGNED:
+    if len(cuts) > 1 and count >= SHARES * ALIGNED:
         assert len(cuts) >= SHARES - 1
         # The two halves of the chunks, in turn, are alike to two chunks at most.
         own = [sum(cut.stop - cut.start for cut in cuts[rank::2]) for rank in (0, 1)]
