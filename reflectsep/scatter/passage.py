@@ -110,7 +110,7 @@ def watch(
     grey = full.mean(0)
     floor = 0.01 * float(quantile(grey[mask].abs(), 0.99)) if mask.any() else 1.0
     scale = grey.clamp(min=max(floor, 1e-12))
-    sums, keeper = _Sums(full, mask, scale, exponents, samples), Keeper(mask)
+    sums, keeper = _Sums(full, mask, scale, exponents, samples), Keeper(mask, len(stream))
     received = 0
     with one_thread(), closing(steps(stream, full, mask)) as walked:
         for step in walked:

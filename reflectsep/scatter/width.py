@@ -49,30 +49,27 @@ class Kept:
 class Keeper:
     """Takes some pixels of every frame as it passes; what is kept is a few megabytes."""
 
-    def __init__(self, mask: Bool[Tensor, "height width"]) -> None:
+    def __init__(self, mask: Bool[Tensor, "height width"], frames: int) -> None:
         where = mask.flatten().nonzero()[:, 0]
         self.at = where[:: max(1, -(-len(where) // PIXELS))]
         self._index: list[int] = []
-        self._value: list[Tensor] = []
-        self._spoilt: list[Tensor] = []
+        # In one piece from the start: a little piece a frame, between frames that come and go, tears memory up.
+        self._value = torch.zeros(frames, len(self.at))
+        self._spoilt = torch.ones(frames, len(self.at), dtype=torch.bool)
 
     def add(self, step: Step) -> None:
         """One frame."""
+        row = len(self._index)
         self._index.append(step.index)
-        self._value.append(step.values.flatten(1)[:, self.at].mean(0))
-        spoilt = torch.full((len(self.at),), step.lost)
+        self._value[row] = step.values.flatten(1)[:, self.at].mean(0)
+        self._spoilt[row] = step.lost
         if step.saturated is not None:
-            spoilt |= step.saturated.flatten(1)[:, self.at].any(0)
-        self._spoilt.append(spoilt)
+            self._spoilt[row] |= step.saturated.flatten(1)[:, self.at].any(0)
 
     def kept(self) -> Kept:
         """What was taken."""
-        return Kept(
-            at=self.at,
-            index=torch.tensor(self._index),
-            value=torch.stack(self._value),
-            spoilt=torch.stack(self._spoilt),
-        )
+        rows = len(self._index)
+        return Kept(at=self.at, index=torch.tensor(self._index), value=self._value[:rows], spoilt=self._spoilt[:rows])
 
 
 def lit_frames(

@@ -66,7 +66,7 @@ def test_nothing_is_said_where_too_few_show_it():
 def test_some_pixels_of_every_frame_are_kept():
     mask = torch.zeros(100, 100, dtype=torch.bool)
     mask[10:90, 10:90] = True
-    keeper = Keeper(mask)
+    keeper = Keeper(mask, 5)  # two of them never come
     for index in range(3):
         values = torch.full((2, 100, 100), float(index))
         values[1] += 2.0
