@@ -53,9 +53,8 @@ def empty(*shape: int, dtype: torch.dtype) -> Tensor:
             # Now, because a disk that is found full while a page is written ends the program without a word.
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
-            raise OSError(
-                error.errno or errno.EIO, f"no room for {size / 2**30:.1f} GiB of maps", str(folder)
-            ) from error
+            reason = os.strerror(error.errno or errno.EIO)
+            raise OSError(error.errno, f"no room for {size / 2**30:.1f} GiB of maps ({reason})", str(folder)) from error
         pages = mmap.mmap(file.fileno(), size)
     return torch.frombuffer(pages, dtype=dtype).view(shape)
 

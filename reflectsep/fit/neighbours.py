@@ -20,8 +20,8 @@ from reflectsep.room import rows
 
 MAD_TO_SD = 1.4826
 PIXELS_OF_WINDOWS = 1 << 16
-PIXELS_OF_A_BAND = 1 << 20
-"""Of the frame, at once."""
+PIXELS_OF_A_BAND = 1 << 18
+"""Of the frame, at once: of a quadratic surface some hundred megabytes are in between."""
 QUADRATIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of x and y of a quadratic surface."""
 
