@@ -244,7 +244,14 @@ def measure(
 
 
 def fit_options(settings: FitSettings) -> FitOptions:
-    """Settings of the command as the stage takes them."""
+    """Settings of the command as the stage takes them.
+
+    Raises:
+        SettingsError: a device that this machine, or this build of torch, does not have.
+    """
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        built = f"torch {torch.__version__} is built {'for' if torch.version.cuda else 'without'} CUDA"
+        raise SettingsError(f"{settings.key}device=cuda: no CUDA device is to be had ({built}); expected cpu")
     return FitOptions(**dataclasses.asdict(settings))
 
 

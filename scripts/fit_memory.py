@@ -72,8 +72,8 @@ def hasten() -> None:
 
     def prepare(*given: object) -> object:
         state = prepared(*given)  # pyright: ignore[reportArgumentType]
-        short = Termination(max_iterations=3)
-        joint = replace(state.effort.joint, max_iterations=1, inner=short)
+        short = Termination(max_iterations=8)
+        joint = replace(state.effort.joint, max_iterations=2, inner=short)
         return replace(state, effort=replace(state.effort, polish=short, joint=joint, minima=1, rounds=1, starts=1))
 
     reflectance.prepare = prepare
@@ -107,8 +107,18 @@ def main(words: list[str]) -> int:
         fit=FitSettings(globals_pixels=100),
     )
     before, watch = resident()[0], Watch()
-    print(pipeline.run_fit(job, watch))
-    watch.stop()
+    try:
+        print(pipeline.run_fit(job, watch))
+    finally:
+        watch.stop()
+        table(watch, before, height, width)
+    return 0
+
+
+def table(watch: Watch, before: int, height: int, width: int) -> None:
+    """Print the peaks, a line a stage."""
+    from reflectsep import room
+
     pixels = height * width
     print(f"{width} x {height}, files from {room.LEAST_BYTES / MiB:.1f} MiB; {before / MiB:.0f} MiB before it began")
     print(f"{'stage':32s} {'memory MiB':>10s} {'B a pixel':>10s} {'in files':>9s} {'B a pixel':>10s} {'s':>7s}")
@@ -118,7 +128,6 @@ def main(words: list[str]) -> int:
     most = max(kept for kept, _, _ in watch.peaks.values())
     files = max(files for _, files, _ in watch.peaks.values())
     print(f"most: {most / MiB:.0f} MiB of memory, {files / MiB:.0f} MiB of files")
-    return 0
 
 
 if __name__ == "__main__":

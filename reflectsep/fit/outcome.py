@@ -166,11 +166,12 @@ def final_flags(
         return torch.where(obs.clipped[cut], found.clamp_max(0.0), found).abs().amax((1, 2))
 
     unlike = in_chunks(len(obs), misfit) > OUTLIER * state.sigma
+    dark = in_chunks(len(obs), lambda cut: (x.d[cut].mean(1) < 0).any(-1))
     marks = {
         Flag.FAINT_LOBE: shine < 3.0 * state.sigma,
         Flag.NOT_CONVERGED: ~found.converged,
         Flag.AMBIGUOUS: found.runner_up < found.cost + AMBIGUOUS_COST,
-        Flag.ATTACHED_SHADOW: (x.d.mean(1) < 0).any(-1),
+        Flag.ATTACHED_SHADOW: dark,
         Flag.SHADOW_OR_OUTLIER: unlike,
         Flag.UNDEREXPOSED: obs.images[..., :3].amax((1, 2)) < 3.0 * state.sigma,
     }

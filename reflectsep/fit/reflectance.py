@@ -18,7 +18,7 @@ from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.body import extend_into_shadow, robust_body
-from reflectsep.fit.chunks import in_chunks
+from reflectsep.fit.chunks import cuts, in_chunks, taken
 from reflectsep.fit.expectations import (
     first_priors,
     near_maximum,
@@ -146,6 +146,7 @@ def observe(
         n_d_sd=max(scattering.n_d_sd / n_d, N_D_SD_LEAST) if use and scattering is not None else N_D_SD,
         swept=scattering.measured if use and scattering is not None else (),
         s_unknown=options.scattering == "unknown" or (use and options.scattering_sd > 0),
+        device=torch.device(options.device),
     )
     return obs, mask, intensity
 
@@ -284,7 +285,7 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
         vote = (state.found.cost <= quantile(state.found.cost, effort.trim)).nonzero()[:, 0]
         shine = in_chunks(len(vote), lambda cut: lobe_pictures(obs, state.found.local[vote[cut]], state.shared))
-        spread = shape_spread(obs, state.found.local[vote], state.shared, shine, state.sigma)
+        spread = shape_spread(obs, taken(state.found.local, vote), state.shared, shine, state.sigma)
         shape = max(state.priors.shape, 1.0 / spread)
         state = rescored(replace(state, priors=replace(state.priors, shape=shape)))
     return state
@@ -336,7 +337,8 @@ def smooth_lobes(state: State, options: FitOptions, progress: Progress) -> State
         if prediction is None:
             continue
         state = rescored(replace(state, priors=with_lobe(state.priors, prediction)))
-        vector = prediction.lobe * state.shared[LOG_C_2].exp()
+        C_2 = state.shared[LOG_C_2].exp()
+        vector = in_chunks(len(state.obs), lambda cut, p=prediction.lobe, C_2=C_2: p[cut] * C_2)
         found = offer_lobes(state.obs, state.priors, state.found, state.shared, vector, state.effort, state.robust)
         state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1} of {len(scales)}", progress)
     return state
@@ -390,7 +392,7 @@ def try_extensions(state: State, options: FitOptions, progress: Progress) -> Sta
     shared, free = state.shared.clone(), state.free.clone()
     if options.lobe == "haze":
         shared[ROOT_HAZE], free[ROOT_HAZE] = 0.2, True
-    if bool((state.obs.s != 0).any()):
+    if any(bool((state.obs.s[cut] != 0).any()) for cut in cuts(len(state.obs))):
         shared[SOFTNESS], free[SOFTNESS] = 0.12, True
     if bool((free == state.free).all()):
         return state

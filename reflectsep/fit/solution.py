@@ -21,6 +21,7 @@ from reflectsep.fit.problem import (
     Observations,
     Priors,
     alpha_of,
+    moved,
     refined,
     unpack,
     unpack_globals,
@@ -79,8 +80,10 @@ def fit_locals(
 
     def fitted(cut: slice) -> tuple[Tensor, ...]:
         index = torch.arange(cut.start, cut.stop)
-        part = fit_chunk(obs.take(index), priors.take(index), shared, effort, robust)
-        return part.local, part.cost, part.runner_up, part.converged
+        there = obs.take(index).there(), moved(priors.take(index), obs.device), shared.to(obs.device)
+        part = fit_chunk(*there, effort, robust)
+        found = part.local, part.cost, part.runner_up, part.converged
+        return tuple(each.to(shared.device) for each in found)
 
     return LocalFit(*by_chunks(len(obs), effort.chunk, fitted))
 
@@ -159,10 +162,10 @@ def fit_globals(
             keep = found.cost.argsort()[:number]
             problem = build_problem(obs.take(keep), priors.take(keep), robust=robust)
             joint = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
-            moved = float((joint.shared - shared).abs().max())
+            step = float((joint.shared - shared).abs().max())
             shared = joint.shared
             way.append(shared)
-            if moved < 1e-3 or met(shared, passed):
+            if step < 1e-3 or met(shared, passed):
                 break
         if not met(shared, passed):
             found = fit_locals(obs, priors, shared, effort, robust)
