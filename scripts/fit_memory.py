@@ -44,8 +44,10 @@ class Watch:
         self._thread.start()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Another stage, or the same further on."""
-        self.stage = stage if done < total else f"after {stage}"
+        """Another stage, or the same further on; the one that ended is told, for a run that is stopped."""
+        before, self.stage = self.stage, stage if done < total else f"after {stage}"
+        if self.stage != before and before in self.peaks:
+            print(f"{before}: {self.peaks[before][0] / MiB:.0f} MiB", file=sys.stderr, flush=True)
 
     def stop(self) -> None:
         """No more samples."""

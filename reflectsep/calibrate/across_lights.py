@@ -36,7 +36,7 @@ MOST_PIXELS = 100_000
 AGREE_PX = 0.35
 """Fine structure that moves apart from outline and shading by more than this is no texture."""
 DEGREE = 5
-LARGEST_PICTURE = 1 << 21
+LARGEST_PICTURE = 1 << 19
 """Pixels; larger ones are halved before anything is made of them."""
 
 

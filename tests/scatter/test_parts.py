@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -94,6 +95,20 @@ def profiles(root, u, half):
         at=torch.arange(u.shape[1]),
         **flat,
     )
+
+
+def test_a_dark_channel_fills_with_next_to_nothing():
+    # A value of exactly 0 in the one frame that is surely lit; everything else is noise.
+    noise = 3e-4
+    u = torch.arange(-11.0, 12.0)[:, None] + torch.linspace(-0.45, 0.45, 50)
+    g = torch.Generator().manual_seed(4)
+    root = noise * torch.randn(u.shape, generator=g).clamp_min(0.0)
+    root[10:13] = 0.0
+    p = profiles(root, u, 1.3)
+    light = torch.cat([torch.full((11,), 1.0), 0.5 ** torch.arange(12.0).square()])[:, None].expand_as(u)
+    slab = Slab(half=1.0, edge=0.6, frames_per_px=0.5)
+    filled = fill_by_profile(replace(p, light=light), slab, distance_px=1.0, noise=noise)
+    assert float(filled.abs().max()) < 10 * noise
 
 
 def test_profile_recovers_its_own_model():
