@@ -28,11 +28,11 @@ _folder: ContextVar[Path | None] = ContextVar("folder", default=None)
 
 @contextmanager
 def room_beside(out: Path | str) -> Iterator[None]:
-    """Large tensors made in here are files in the folder that `out` is to stand in."""
+    """Large tensors made in here are files in the folder that `out` stands in; memory where nothing may be written."""
     folder = Path(out).absolute().parent
     while not folder.is_dir():
         folder = folder.parent
-    token = _folder.set(folder)
+    token = _folder.set(folder if os.access(folder, os.W_OK) else None)
     try:
         yield
     finally:

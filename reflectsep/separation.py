@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from reflectsep.errors import ResultError
 from reflectsep.flags import count
 from reflectsep.io.result import read_result, write_result
 from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_power, reflectance
-from reflectsep.room import empty, stacked
+from reflectsep.room import empty, room_beside, stacked
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
 LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
@@ -279,26 +280,38 @@ def load(folder: Path | str) -> Separation:
         ResultError: not a result, another format, a damaged or missing file, or an inconsistent document.
     """
     folder = Path(folder)
-    layers, document = read_result(folder, LAYERS)
+    _, document = read_result(folder, ())
     try:
-        return from_layers(layers, document)
+        with room_beside(folder):
+            return from_layers(folder, document)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultError(
             f"{folder}: separation.json and the EXR layers do not belong together ({type(error).__name__}: {error})"
         ) from error
 
 
-def from_layers(layers: Mapping[str, Mapping[str, np.ndarray]], document: Mapping[str, Any]) -> Separation:
-    """A separation from its layers and document."""
+def from_layers(folder: Path, document: Mapping[str, Any]) -> Separation:
+    """A separation from its document and its layers, of which one file is in memory at a time."""
+    layers = {name: partial(_layer, folder, name) for name in LAYERS}
     lights = document["lights"]
     basis = tuple(document["basis"])
     names = (*basis, *(name for name in lights if name not in basis))
-    parameters = layers["parameters.exr"]
+    parameters = layers["parameters.exr"]()
     channels = GREY if "d1.Y" in parameters else COLOUR
 
     def stack(planes: Mapping[str, np.ndarray], rows: tuple[str, ...]) -> Tensor:
-        return torch.stack([torch.stack([torch.from_numpy(planes[f"{row}.{c}"]) for c in channels]) for row in rows])
+        part = lambda row: torch.stack([torch.from_numpy(planes[f"{row}.{c}"]) for c in channels])  # noqa: E731
+        return stacked((part(row) for row in rows), len(rows))
 
+    maps = {
+        name: stack(parameters, tuple(f"{name[0]}{k}{name[1:]}" for k in "123")) for name in ("d", "s", "d_sd", "s_sd")
+    }
+    maps |= {name: stack(parameters, (name,))[0] for name in ("B", "B_sd")}
+    maps["mask"] = torch.from_numpy(parameters["mask"].astype(np.int64)) > 0
+    maps["flags"] = torch.from_numpy(parameters["flags"].astype(np.int32))
+    del parameters
+    maps |= {name: stack(layers[f"{name}.exr"](), basis) for name in COMPONENTS}
+    maps["residual"] = stack(layers["residual.exr"](), names)
     vectors = [lights[name].get("vector") for name in names]
     shared = {key: torch.tensor(document["globals"][key], dtype=torch.float32) for key in document["globals"]}
     if any(not math.isfinite(v) for tensor in shared.values() for v in tensor.flatten().tolist()):
@@ -309,16 +322,12 @@ def from_layers(layers: Mapping[str, Mapping[str, np.ndarray]], document: Mappin
         alpha=torch.tensor([lights[name]["alpha"] for name in names], dtype=torch.float32),
         light_vectors=None if None in vectors else torch.tensor(vectors, dtype=torch.float32),
         view=torch.tensor(document["view"], dtype=torch.float32),
-        mask=torch.from_numpy(parameters["mask"].astype(np.int64)) > 0,
-        flags=torch.from_numpy(parameters["flags"].astype(np.int32)),
         **shared,
-        d=stack(parameters, ("d1", "d2", "d3")),
-        s=stack(parameters, ("s1", "s2", "s3")),
-        B=stack(parameters, ("B",))[0],
-        d_sd=stack(parameters, ("d1_sd", "d2_sd", "d3_sd")),
-        s_sd=stack(parameters, ("s1_sd", "s2_sd", "s3_sd")),
-        B_sd=stack(parameters, ("B_sd",))[0],
-        **{name: stack(layers[f"{name}.exr"], basis) for name in COMPONENTS},
-        residual=stack(layers["residual.exr"], names),
+        **maps,
         document={key: value for key, value in document.items() if key not in ours},
     )
+
+
+def _layer(folder: Path, name: str) -> dict[str, np.ndarray]:
+    """Planes of one file of a result."""
+    return read_result(folder, (name,))[0][name]

@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from reflectsep import separation
+from reflectsep import room, separation
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import ResultError
 from reflectsep.flags import Flag
@@ -241,6 +242,17 @@ def test_a_saved_result_comes_back_bit_for_bit(tmp_path, channels, known):
     assert_same(result, back)
     alpha = torch.tensor([0.3, 0.5, 0.4])
     assert torch.equal(back.relight(alpha), result.relight(alpha))
+
+
+def test_a_large_result_is_read_into_files_beside_it(tmp_path, monkeypatch):
+    result = make_separation(channels=3)[0]
+    result.save(tmp_path / "out")
+    monkeypatch.setattr(room, "LEAST_BYTES", 1)
+    same = load(tmp_path / "out")
+    maps = Path("/proc/self/maps").read_text()
+    assert maps.count(str(tmp_path)) >= len(separation.COMPONENTS) + 7
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert_same(same, result)
 
 
 def test_an_existing_folder_is_not_replaced_unasked(tmp_path):
