@@ -158,6 +158,7 @@ class FitSettings:
     chunk: int = setting(4096, "pixels handled at once; bounds the memory", at_least=1)
     prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
+    device: Literal["cpu", "cuda"] = setting("cpu", "where chunks of pixels are solved; for cuda a larger fit.chunk")
 
     def __post_init__(self) -> None:
         check(self)

@@ -44,11 +44,14 @@ from reflectsep.recorded import held_out_rows, lin_lee_beside, real_pictures, re
 from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
 from reflectsep.report.sheet import motion_plot
 from reflectsep.report.tone import tone, white_point
+from reflectsep.room import room_beside
 from reflectsep.separation import Separation, load
 from reflectsep.solve.sharing import workers
 from reflectsep.summary import capture_summary, summary
 from reflectsep.workload import reading, reporting, solving
 
+PREVIEW_PIXELS = 1 << 22
+"""A preview is a quick look: larger pictures are halved."""
 LIN_LEE = "Lin & Lee beside"
 QUICK_S = 60.0
 """Lin & Lee's model is fitted unasked where it is expected to take no longer."""
@@ -57,17 +60,26 @@ QUICK_S = 60.0
 def previews(separation: Separation) -> dict[str, Tensor]:
     """Pictures for a quick look, encoded for a screen, every component of a light with a stated white point."""
     shown: dict[str, Tensor] = {}
-    original = separation.highlight_free + separation.specular
-    white = white_point(original, separation.mask)
+    parts = ("specular", "local_diffuse", "scattering", "highlight_free")
+    small = {part: reduced(getattr(separation, part), PREVIEW_PIXELS) for part in parts}
+    mask = reduced(separation.mask[None, None], PREVIEW_PIXELS)[0, 0] > 0.5
+    small = {"original": small["highlight_free"] + small["specular"], **small}
+    white = white_point(small["original"], mask)
     for i, name in enumerate(separation.basis):
-        parts = {"original": original, "specular": separation.specular, "local_diffuse": separation.local_diffuse}
-        parts |= {"scattering": separation.scattering, "highlight_free": separation.highlight_free}
-        for part, stack in parts.items():
+        for part, stack in small.items():
             pixels = torch.from_numpy(tone(stack[i], white=white)).permute(2, 0, 1)
             shown[f"{name}_{part}"] = pixels.float() / 255.0
     if "alignment" in separation.document:
         shown["alignment"] = motion_plot(separation.document["alignment"])
     return shown
+
+
+def reduced(pictures: Tensor, most: int) -> Tensor:
+    """Pictures (lights, channels, height, width) halved until they have `most` pixels or fewer, means of 2 x 2."""
+    parts = [picture.float() for picture in pictures]
+    while parts[0][0].numel() > most:
+        parts = [torch.nn.functional.avg_pool2d(part, 2, ceil_mode=True) for part in parts]
+    return torch.stack(parts)
 
 
 def run_simulate(job: SimulateJob, progress: Progress = silent) -> str:
@@ -104,6 +116,11 @@ def run_capture_and_fit(job: CaptureAndFitJob, progress: Progress = silent) -> s
 def run_fit(job: FitJob, progress: Progress = silent) -> str:
     """Separate a capture into a result folder."""
     refuse_folder(job.out, job.overwrite)
+    with room_beside(job.out):
+        return _fit_to_folder(job, progress)
+
+
+def _fit_to_folder(job: FitJob, progress: Progress) -> str:
     capture = load_capture(
         job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
     )

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.alignment import Alignment, align, aligned_stream
 from reflectsep.calibrate.exposure import developed_stream, response_of
@@ -36,6 +38,9 @@ from reflectsep.summary import describe
 from reflectsep.workload import Counts, reading, solving
 
 __all__ = ["fit", "load", "load_capture"]
+
+PREVIEW_PIXELS = 1 << 22
+"""A preview is a quick look: larger pictures are halved."""
 
 
 def fit(
@@ -210,7 +215,14 @@ def measure(
 
 
 def fit_options(settings: FitSettings) -> FitOptions:
-    """Settings of the command as the stage takes them."""
+    """Settings of the command as the stage takes them.
+
+    Raises:
+        SettingsError: a device that this machine, or this build of torch, does not have.
+    """
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        built = f"torch {torch.__version__} is built {'for' if torch.version.cuda else 'without'} CUDA"
+        raise SettingsError(f"{settings.key}device=cuda: no CUDA device is to be had ({built}); expected cpu")
     return FitOptions(**dataclasses.asdict(settings))
 
 

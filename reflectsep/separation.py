@@ -13,8 +13,9 @@ model it goes on below zero beyond the edge of an attached shadow, so there too 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -29,9 +30,13 @@ from reflectsep.errors import ResultError
 from reflectsep.flags import count
 from reflectsep.io.result import read_result, write_result
 from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_power, reflectance
+from reflectsep.room import empty, room_beside, stacked
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
 LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
+MAPS = (*COMPONENTS, "mask", "flags", "d", "s", "B", "d_sd", "s_sd", "B_sd", "residual")
+PIXELS_AT_ONCE = 1 << 18
+"""Of which components are made."""
 GREY, COLOUR = ("Y",), ("R", "G", "B")
 
 
@@ -109,6 +114,11 @@ class Separation:
         pictures = pictures.permute(3, 2, 0, 1) * intensity[:, None, None, None] * self.mask
         return pictures.reshape(*lead, *pictures.shape[1:])
 
+    def rows(self, rows: slice) -> Separation:
+        """The same of some of the picture's rows; it shares their memory."""
+        maps = {name: value[..., rows, :] for name, value in vars(self).items() if name in MAPS}
+        return replace(self, **maps)
+
     def unit_mix(self, alpha: Float[Tensor, "lights 3"]) -> tuple[Float[Tensor, "lights 3"], Float[Tensor, "lights"]]:
         """Alpha among basis lights of unit intensity for a light of unit intensity, and the light's intensity."""
         if self.light_vectors is None:
@@ -125,7 +135,7 @@ class Separation:
             ResultError: `out` exists and `overwrite` is false, or it is no result.
         """
         channels = GREY if self.d.shape[1] == 1 else COLOUR
-        layers: dict[str, dict[str, np.ndarray]] = {}
+        layers: dict[str, Mapping[str, np.ndarray]] = {}
         for name in COMPONENTS:
             layers[f"{name}.exr"] = picture_channels(self.basis, getattr(self, name), channels)
         layers["residual.exr"] = picture_channels(self.names, self.residual, channels)
@@ -172,7 +182,7 @@ class Separation:
 def picture_channels(names: tuple[str, ...], stack: Tensor, channels: tuple[str, ...]) -> dict[str, np.ndarray]:
     """`stack` (names, channels, height, width) as planes `NAME.R` or `NAME.Y`."""
     return {
-        f"{name}.{c}": np.ascontiguousarray(stack[i, j].detach().cpu().numpy().astype(np.float32))
+        f"{name}.{c}": np.ascontiguousarray(stack[i, j].detach().cpu().numpy(), np.float32)
         for i, name in enumerate(names)
         for j, c in enumerate(channels)
     }
@@ -182,13 +192,10 @@ def separate(
     stack: PhotometricStack, scattering: Scattering | None, fit: Fit, document: Mapping[str, Any]
 ) -> Separation:
     """Components of every basis light from the fitted parameters."""
-    s_sd = torch.zeros_like(fit.d)
-    measured = fit.s[:3]
-    if scattering is not None:
-        if scattering.root_sd is not None:
-            s_sd = scattering.root_sd[:3].float() * stack.mask
-        intensity_root = fit.intensity[:3, None, None, None] ** (1.0 / float(fit.n_d))
-        measured = scattering.root[:3].float() / intensity_root
+    nothing = fit.d.new_zeros(()).expand_as(fit.d)  # in the memory of one value
+    s_sd = nothing
+    if scattering is not None and scattering.root_sd is not None:
+        s_sd = stacked((picture.float() * stack.mask for picture in scattering.root_sd[:3]), 3)
     alpha, vectors = stack.alpha.float(), None if stack.light_vectors is None else stack.light_vectors.float()
     if fit.alpha is not None:
         alpha = fit.alpha
@@ -211,33 +218,53 @@ def separate(
         d_sd=fit.d_sd,
         s_sd=s_sd,
         B_sd=fit.B_sd,
-        specular=torch.zeros_like(fit.d),
-        local_diffuse=torch.zeros_like(fit.d),
-        scattering=torch.zeros_like(fit.d),
-        diffuse=torch.zeros_like(fit.d),
-        highlight_free=torch.zeros_like(fit.d),
+        specular=nothing,
+        local_diffuse=nothing,
+        scattering=nothing,
+        diffuse=nothing,
+        highlight_free=nothing,
         residual=fit.residual,
         document=document,
     )
+    intensity_root = fit.intensity[:3, None, None, None] ** (1.0 / float(fit.n_d))
+
+    def measured(rows: slice) -> Tensor:
+        if scattering is None:
+            return separation.s[:, :, rows]
+        return scattering.root[:3, :, rows].float() / intensity_root
+
     return with_components(separation, stack, measured)
 
 
-def with_components(separation: Separation, stack: PhotometricStack, measured: Tensor) -> Separation:
-    """`separation` with its components filled in; `measured` is s_k as the sweeps gave it."""
-    t = separation.intensity[:, None, None, None]
-    d, B = separation.d.permute(2, 3, 1, 0), separation.B.mean(0)
-    u = lobe_argument(d, B, separation.a, torch.eye(3)).permute(2, 0, 1)[:, None]
-    specular = (t * lobe(u, separation.n_s, separation.haze) * stack.mask).expand_as(separation.d)
-    diffuse = separation.relight(torch.eye(3)) - specular
-    unknown = stack.saturated[:3] | ~stack.images[:3].isfinite() | ~stack.mask
-    return replace(
-        separation,
-        specular=specular.contiguous(),
-        local_diffuse=t * positive_power(separation.d, separation.n_d),
-        scattering=t * positive_power(measured, separation.n_d) * stack.mask,
-        diffuse=diffuse,
-        highlight_free=torch.where(unknown, diffuse, stack.images[:3].float() - specular),
-    )
+def with_components(separation: Separation, stack: PhotometricStack, measured: Callable[[slice], Tensor]) -> Separation:
+    """`separation` with its components filled in; `measured` gives rows of s_k as the sweeps had it."""
+    found = {name: empty(*separation.d.shape, dtype=separation.d.dtype) for name in COMPONENTS}
+    height, width = separation.mask.shape
+    band = max(1, PIXELS_AT_ONCE // width)
+    for top in range(0, height, band):
+        band_rows = slice(top, min(top + band, height))
+        for name, values in _components(separation, stack, measured(band_rows), band_rows).items():
+            found[name][..., band_rows, :] = values
+    return replace(separation, **found)
+
+
+def _components(separation: Separation, stack: PhotometricStack, measured: Tensor, rows: slice) -> dict[str, Tensor]:
+    """Components of some of the picture's rows."""
+    part = separation.rows(rows)
+    t = part.intensity[:, None, None, None]
+    d, B = part.d.permute(2, 3, 1, 0), part.B.mean(0)
+    u = lobe_argument(d, B, part.a, torch.eye(3)).permute(2, 0, 1)[:, None]
+    specular = (t * lobe(u, part.n_s, part.haze) * part.mask).expand_as(part.d)
+    diffuse = part.relight(torch.eye(3)) - specular
+    pictures = stack.images[:3, :, rows]
+    unknown = stack.saturated[:3, :, rows] | ~pictures.isfinite() | ~part.mask
+    return {
+        "specular": specular,
+        "local_diffuse": t * positive_power(part.d, part.n_d),
+        "scattering": t * positive_power(measured, part.n_d) * part.mask,
+        "diffuse": diffuse,
+        "highlight_free": torch.where(unknown, diffuse, pictures.float() - specular),
+    }
 
 
 def extensions(softness: float, haze: float) -> str:
@@ -253,26 +280,38 @@ def load(folder: Path | str) -> Separation:
         ResultError: not a result, another format, a damaged or missing file, or an inconsistent document.
     """
     folder = Path(folder)
-    layers, document = read_result(folder, LAYERS)
+    _, document = read_result(folder, ())
     try:
-        return from_layers(layers, document)
+        with room_beside(folder):
+            return from_layers(folder, document)
     except (KeyError, TypeError, ValueError) as error:
         raise ResultError(
             f"{folder}: separation.json and the EXR layers do not belong together ({type(error).__name__}: {error})"
         ) from error
 
 
-def from_layers(layers: Mapping[str, Mapping[str, np.ndarray]], document: Mapping[str, Any]) -> Separation:
-    """A separation from its layers and document."""
+def from_layers(folder: Path, document: Mapping[str, Any]) -> Separation:
+    """A separation from its document and its layers, of which one file is in memory at a time."""
+    layers = {name: partial(_layer, folder, name) for name in LAYERS}
     lights = document["lights"]
     basis = tuple(document["basis"])
     names = (*basis, *(name for name in lights if name not in basis))
-    parameters = layers["parameters.exr"]
+    parameters = layers["parameters.exr"]()
     channels = GREY if "d1.Y" in parameters else COLOUR
 
     def stack(planes: Mapping[str, np.ndarray], rows: tuple[str, ...]) -> Tensor:
-        return torch.stack([torch.stack([torch.from_numpy(planes[f"{row}.{c}"]) for c in channels]) for row in rows])
+        part = lambda row: torch.stack([torch.from_numpy(planes[f"{row}.{c}"]) for c in channels])  # noqa: E731
+        return stacked((part(row) for row in rows), len(rows))
 
+    maps = {
+        name: stack(parameters, tuple(f"{name[0]}{k}{name[1:]}" for k in "123")) for name in ("d", "s", "d_sd", "s_sd")
+    }
+    maps |= {name: stack(parameters, (name,))[0] for name in ("B", "B_sd")}
+    maps["mask"] = torch.from_numpy(parameters["mask"].astype(np.int64)) > 0
+    maps["flags"] = torch.from_numpy(parameters["flags"].astype(np.int32))
+    del parameters
+    maps |= {name: stack(layers[f"{name}.exr"](), basis) for name in COMPONENTS}
+    maps["residual"] = stack(layers["residual.exr"](), names)
     vectors = [lights[name].get("vector") for name in names]
     shared = {key: torch.tensor(document["globals"][key], dtype=torch.float32) for key in document["globals"]}
     if any(not math.isfinite(v) for tensor in shared.values() for v in tensor.flatten().tolist()):
@@ -283,16 +322,12 @@ def from_layers(layers: Mapping[str, Mapping[str, np.ndarray]], document: Mappin
         alpha=torch.tensor([lights[name]["alpha"] for name in names], dtype=torch.float32),
         light_vectors=None if None in vectors else torch.tensor(vectors, dtype=torch.float32),
         view=torch.tensor(document["view"], dtype=torch.float32),
-        mask=torch.from_numpy(parameters["mask"].astype(np.int64)) > 0,
-        flags=torch.from_numpy(parameters["flags"].astype(np.int32)),
         **shared,
-        d=stack(parameters, ("d1", "d2", "d3")),
-        s=stack(parameters, ("s1", "s2", "s3")),
-        B=stack(parameters, ("B",))[0],
-        d_sd=stack(parameters, ("d1_sd", "d2_sd", "d3_sd")),
-        s_sd=stack(parameters, ("s1_sd", "s2_sd", "s3_sd")),
-        B_sd=stack(parameters, ("B_sd",))[0],
-        **{name: stack(layers[f"{name}.exr"], basis) for name in COMPONENTS},
-        residual=stack(layers["residual.exr"], names),
+        **maps,
         document={key: value for key, value in document.items() if key not in ours},
     )
+
+
+def _layer(folder: Path, name: str) -> dict[str, np.ndarray]:
+    """Planes of one file of a result."""
+    return read_result(folder, (name,))[0][name]

@@ -34,7 +34,11 @@ def describe(  # noqa: PLR0913  (every stage has its say)
     alignment: Alignment | None = None,
 ) -> dict[str, Any]:
     """What `separation.json` says beside the globals."""
-    residual = fitted.residual[..., stack.mask]
+    squares, largest = [], 0.0
+    for picture in fitted.residual:
+        values = picture[:, stack.mask]
+        largest = max(largest, float(values.abs().amax()))
+        squares.append(float(values.square().mean()))
     warnings = [*lights.warnings, *missing_darks(capture), *fitted.warnings]
     wanted = settings["fit"]["scattering"]
     model = "Wu & Tang: off-specular, local diffuse and scattering"
@@ -59,9 +63,9 @@ def describe(  # noqa: PLR0913  (every stage has its say)
         "cost": fitted.cost,
         "iterations": fitted.iterations,
         "residual": {
-            "rms": float(residual.square().mean().sqrt()),
-            "rms_by_light": {n: float(residual[i].square().mean().sqrt()) for i, n in enumerate(stack.names)},
-            "largest": float(residual.abs().amax()),
+            "rms": math.sqrt(sum(squares) / len(squares)),
+            "rms_by_light": {n: math.sqrt(square) for n, square in zip(stack.names, squares, strict=True)},
+            "largest": largest,
         },
         "settings": {group: dict(values) for group, values in settings.items()},
         "versions": {

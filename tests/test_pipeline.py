@@ -14,7 +14,7 @@ import pytest
 import torch
 
 import reflectsep
-from reflectsep import jobs, pipeline, recorded
+from reflectsep import jobs, pipeline, recorded, room
 from reflectsep.comparison import bounded
 from reflectsep.config import (
     CompareJob,
@@ -32,9 +32,11 @@ from reflectsep.estimate import TimeLeft
 from reflectsep.fit import reflectance
 from reflectsep.io.exr import read_channels
 from reflectsep.io.pictures import read_picture
+from reflectsep.separation import LAYERS
 from reflectsep.summary import summary
 
 QUICK = FitSettings(tolerance=1e-2, max_iterations=2, globals_pixels=40, lobe="single", scattering_sd=0.0)
+EVERY_STAGE = FitSettings(tolerance=1e-2, max_iterations=2, globals_pixels=40)
 RIG = RigSettings(slab_width_px=8.0, slab_step_px=4.0, lights=7, sweeps=3, heldout=2)
 
 
@@ -133,6 +135,21 @@ def test_the_report_has_lin_and_lee_beside_where_that_is_quick_or_asked_for(resu
     monkeypatch.setattr(jobs, "QUICK_S", 0.0)
     assert not jobs.wants_baseline(job, capture)
     assert jobs.wants_baseline(dataclasses.replace(job, baseline=True), capture)
+
+
+def test_maps_in_files_give_the_same_result_bit_for_bit(folder, captured, monkeypatch):
+    made = []
+    for name in ("in_memory", "in_files"):
+        job = FitJob(capture=str(captured), out=str(folder / name / "result"), fit=EVERY_STAGE, report=False)
+        (folder / name).mkdir()
+        jobs.run_fit(job)
+        # From here on whatever has more than two values a pixel goes into a file.
+        monkeypatch.setattr(room, "LEAST_BYTES", 28 * 28 * 8 * 2)
+        monkeypatch.setattr(room.mmap, "mmap", lambda *given, m=room.mmap.mmap: made.append(given) or m(*given))
+    assert len(made) > 20
+    assert sorted(path.name for path in (folder / "in_files").iterdir()) == ["result"]
+    for name in LAYERS:
+        assert (folder / "in_files/result" / name).read_bytes() == (folder / "in_memory/result" / name).read_bytes()
 
 
 def test_document_says_how_it_came_about(result, captured):

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from reflectsep import room, separation
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import ResultError
 from reflectsep.flags import Flag
@@ -106,6 +108,22 @@ def test_components_are_their_formulas(made):
         e, x = float(fit.softness) * fit.s[:3].mean(0), fit.d[k] + fit.s[k]
         whole = t * (0.5 * (x + (x.square() + e.square()).sqrt())).clamp_min(0) ** n_d * stack.mask
         torch.testing.assert_close(result.diffuse[k], whole, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("pixels", [1, WIDTH, 4 * WIDTH])
+def test_components_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, pixels):
+    whole = make_separation(channels=3, n_d=1.4, softness=0.2)[0]
+    monkeypatch.setattr(separation, "PIXELS_AT_ONCE", pixels)
+    parts = make_separation(channels=3, n_d=1.4, softness=0.2)[0]
+    for name in separation.COMPONENTS:
+        # But for powers, which a processor computes otherwise for the last few of a row of numbers.
+        torch.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=1e-6, atol=1e-7)
+
+
+def test_rows_of_a_result_relight_to_rows_of_its_picture(made):
+    result = made[0]
+    mix = torch.tensor([0.3, 0.4, 0.3])
+    torch.testing.assert_close(result.rows(slice(2, 5)).relight(mix), result.relight(mix)[:, 2:5])
 
 
 def test_highlight_free_is_the_picture_less_its_highlight_but_the_model_where_clipped(made):
@@ -224,6 +242,17 @@ def test_a_saved_result_comes_back_bit_for_bit(tmp_path, channels, known):
     assert_same(result, back)
     alpha = torch.tensor([0.3, 0.5, 0.4])
     assert torch.equal(back.relight(alpha), result.relight(alpha))
+
+
+def test_a_large_result_is_read_into_files_beside_it(tmp_path, monkeypatch):
+    result = make_separation(channels=3)[0]
+    result.save(tmp_path / "out")
+    monkeypatch.setattr(room, "LEAST_BYTES", 1)
+    same = load(tmp_path / "out")
+    maps = Path("/proc/self/maps").read_text()
+    assert maps.count(str(tmp_path)) >= len(separation.COMPONENTS) + 7
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert_same(same, result)
 
 
 def test_an_existing_folder_is_not_replaced_unasked(tmp_path):

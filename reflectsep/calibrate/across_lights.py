@@ -7,15 +7,18 @@ structure agrees with it, the surface has texture, which is more exact and alone
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from reflectsep.calibrate.align_options import MARGIN_PX, AlignOptions, grown, judged
 from reflectsep.calibrate.motion import Model, Motion
+from reflectsep.calibrate.pyramid import from_level
 from reflectsep.calibrate.register import FEWEST_PIXELS, RegisterOptions, Registration, register
 from reflectsep.errors import CaptureError
 
@@ -33,6 +36,8 @@ MOST_PIXELS = 100_000
 AGREE_PX = 0.35
 """Fine structure that moves apart from outline and shading by more than this is no texture."""
 DEGREE = 5
+LARGEST_PICTURE = 1 << 19
+"""Pixels; larger ones are halved before anything is made of them."""
 
 
 def across(
@@ -51,6 +56,25 @@ def across(
         options: settings.
     """
     options = options or AlignOptions()
+    factor = 1
+    while reference.numel() > LARGEST_PICTURE and min(reference.shape) > 2:
+        # Shading alone is two dozen maps of the picture's size, and only far smaller pictures are compared.
+        reference, picture = (avg_pool2d(each[None], 2)[0] for each in (reference, picture))
+        mask = avg_pool2d(mask[None].float(), 2)[0] > 0.5
+        factor *= 2
+    found = _across(reference, picture, mask, options)
+    if factor == 1:
+        return found
+    return replace(
+        found,
+        matrix=from_level(found.matrix, factor),
+        displacement_px=factor * found.displacement_px,
+        sd_px=factor * found.sd_px,
+    )
+
+
+def _across(reference: Tensor, picture: Tensor, mask: Tensor, options: AlignOptions) -> Motion:
+    """`across` of pictures that are no larger than `LARGEST_PICTURE`."""
     usable = grown(mask, MARGIN_PX)
     models: tuple[Model, ...] = options.models[:3]  # up to a rigid motion
     try:

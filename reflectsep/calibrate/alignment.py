@@ -27,6 +27,7 @@ from reflectsep.data import Capture, Frame, FrameStream, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io.ahead import frames_of
 from reflectsep.progress import Progress, silent
+from reflectsep.room import empty
 from reflectsep.solve.sharing import by_items
 
 CLIPPED_SHARE = 0.5
@@ -109,9 +110,12 @@ def align(
         CaptureError: nothing to compare.
     """
     options = options or AlignOptions()
-    grey = roots_of(pictures, options.n_d).mean(1)
-    good = ~saturated.any(1) & torch.isfinite(grey)
-    grey = torch.where(torch.isfinite(grey), grey, 0.0).double()
+    count, height, width = len(pictures), *mask.shape
+    grey, good = empty(count, height, width, dtype=torch.float64), empty(count, height, width, dtype=torch.bool)
+    for i, picture in enumerate(pictures):
+        own = roots_of(picture, options.n_d).mean(0)
+        good[i] = ~saturated[i].any(0) & torch.isfinite(own)
+        grey[i] = torch.where(torch.isfinite(own), own, 0.0)
     motions = {name: Motion(reason="reference" if i == 0 else "not looked for") for i, name in enumerate(names)}
     if options.scope == "all":
 

@@ -21,6 +21,7 @@ from reflectsep.data import Capture, PhotometricStack
 from reflectsep.errors import CaptureError, LightError
 from reflectsep.flags import Flag, mark
 from reflectsep.io.stack import RawPictures, read_bracket, read_dark, read_full, read_mask
+from reflectsep.room import empty
 from reflectsep.settings import nearest
 
 MINIMUM = 6
@@ -80,18 +81,20 @@ def calibrate_stack(
     raw = read_full(capture)
     on_object = read_mask(capture)
     images, saturated = develop_pictures(capture, raw, response_of(capture))
-    raw = replace(raw, saturated=saturated)
-    _check_pictures(capture, images, torch.isfinite(images), on_object)
+    raw = replace(raw, values=images, saturated=saturated)
+    _check_pictures(capture, images, on_object)
     seen = torch.ones_like(on_object)
     if alignment is not None and alignment.moved:
         images, saturated, seen = _still(raw, images, alignment)
-        raw = replace(raw, saturated=saturated)
-    finite = torch.isfinite(images)
-    valid = finite.all(1).all(0) & seen
+        raw = replace(raw, values=images, saturated=saturated)
+    valid = seen
+    for picture in images:
+        valid = valid & torch.isfinite(picture).all(0)
     mask = on_object & valid
     if not bool(mask.any()):
         raise CaptureError(f"{capture.folder}: no pixel of the object is finite in all {len(raw.names)} pictures")
-    images = torch.where(valid, images, 0.0)
+    for picture in images:
+        picture.masked_fill_(~valid, 0.0)
     vectors = [light_vector(capture.lights[name]) for name in raw.names]
     report = solve_alpha(
         raw.names, vectors, images, mask & ~raw.saturated, settings=settings, condition_limit=condition_limit
@@ -117,15 +120,14 @@ def calibrate_stack(
 
 def _still(raw: RawPictures, images: Tensor, alignment: Alignment) -> tuple[Tensor, Tensor, Tensor]:
     """Pictures with their motions undone, each resampled once; clipped values; and pixels that all of them have."""
-    still, clipped = [], []
-    for name, picture, saturated in zip(raw.names, images, raw.saturated, strict=True):
+    still, clipped = empty(*images.shape, dtype=images.dtype), empty(*images.shape, dtype=torch.bool)
+    for i, (name, picture, saturated) in enumerate(zip(raw.names, images, raw.saturated, strict=True)):
         motion = alignment.pictures[name]
         if motion.applied:
             picture, moved, _ = warp(picture, motion.matrix, saturated)  # noqa: PLW2901
             saturated = saturated if moved is None else moved  # noqa: PLW2901
-        still.append(picture)
-        clipped.append(saturated)
-    return torch.stack(still), torch.stack(clipped), covered(alignment, *images.shape[-2:])
+        still[i], clipped[i] = picture, saturated
+    return still, clipped, covered(alignment, *images.shape[-2:])
 
 
 def without(capture: Capture, drop: Sequence[str]) -> Capture:
@@ -152,17 +154,19 @@ def develop_pictures(
     Raises:
         CaptureError: an unreadable dark or flat picture, or an intensity that does not fit the channels.
     """
-    pictures, clipped = [], []
-    for name, values, saturated, exposure_s in zip(raw.names, raw.values, raw.saturated, raw.exposure_s, strict=True):
+    pictures = empty(*raw.values.shape, dtype=raw.values.dtype)
+    clipped = empty(*raw.saturated.shape, dtype=torch.bool)
+    exposures = zip(raw.names, raw.values, raw.saturated, raw.exposure_s, strict=True)
+    for i, (name, values, saturated, exposure_s) in enumerate(exposures):
         picture = _developed(capture, name, values, exposure_s, response)
         if capture.bracketed(name):
             picture, saturated = _merged(capture, name, values, response)  # noqa: PLW2901
         colour = colour_of(capture.lights[name], raw.values.shape[1])
         picture = picture if colour is None else picture / colour
         flat = flat_of(capture, name, response)
-        pictures.append(picture if flat is None else picture / flat)
-        clipped.append(saturated)
-    return torch.stack(pictures), torch.stack(clipped)
+        pictures[i] = picture if flat is None else picture / flat
+        clipped[i] = saturated
+    return pictures, clipped
 
 
 def _developed(
@@ -202,11 +206,11 @@ def check_names(capture: Capture, names: Sequence[str]) -> None:
             )
 
 
-def _check_pictures(capture: Capture, images: Tensor, finite: Tensor, on_object: Tensor) -> None:
+def _check_pictures(capture: Capture, images: Tensor, on_object: Tensor) -> None:
     """Refuse pictures that say nothing of the object."""
-    for name, picture, good in zip(capture.names, images, finite, strict=True):
+    for name, picture in zip(capture.names, images, strict=True):
         file = capture.folder / capture.full(name).file
-        seen = good & on_object
+        seen = torch.isfinite(picture) & on_object
         if not bool(seen.any()):
             raise CaptureError(f"{file}: not one finite value on the object")
         if not bool((picture[seen] > 0).any()):

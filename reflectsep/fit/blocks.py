@@ -46,6 +46,7 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
             priors.s_weight,
         ),
         threshold=threshold,
+        device=obs.device,
         shared_residual=lambda shared: shared_residual(shared, obs.cosine, priors),
     )
 
@@ -54,7 +55,16 @@ def regroup(data: tuple[Tensor, ...], obs: Observations, priors: Priors) -> tupl
     """The solver's per-block tensors, back in their named places."""
     images, s, weight, clipped, parallel, ratio, ratio_weight, lobe, lobe_weight, facing, facing_weight, s_weight = data
     return (
-        replace(obs, images=images, s=s, weight=weight, clipped=clipped),
+        replace(
+            obs,
+            images=images,
+            s=s,
+            weight=weight,
+            clipped=clipped,
+            alpha=obs.alpha.to(images.device),
+            normal_map=obs.normal_map.to(images.device),
+            view=obs.view.to(images.device),
+        ),
         replace(
             priors,
             parallel=parallel,

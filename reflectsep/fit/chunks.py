@@ -6,23 +6,23 @@ from collections.abc import Callable, Iterator
 
 from torch import Tensor
 
+from reflectsep.room import by_rows
+
 AT_ONCE = 1 << 15
 """Pixels: some ten megabytes of what is in between."""
 
 
 def cuts(pixels: int) -> Iterator[slice]:
-    """0 .. pixels - 1, `AT_ONCE` at a time; one empty cut where there are none."""
-    for start in range(0, max(pixels, 1), AT_ONCE):
+    """0 .. pixels - 1, `AT_ONCE` at a time."""
+    for start in range(0, pixels, AT_ONCE):
         yield slice(start, min(start + AT_ONCE, pixels))
 
 
 def in_chunks(pixels: int, work: Callable[[slice], Tensor]) -> Tensor:
     """What `work` gives for the pixels of every cut, in their order; for work on each pixel by itself."""
-    result: Tensor | None = None
-    for cut in cuts(pixels):
-        part = work(cut)
-        if result is None:
-            result = part.new_empty(pixels, *part.shape[1:])
-        result[cut] = part
-    assert result is not None  # there is a cut, if only an empty one
-    return result
+    return by_rows(pixels, AT_ONCE, work)
+
+
+def taken(values: Tensor, index: Tensor) -> Tensor:
+    """Rows `index` of `values`, which may be most of them."""
+    return in_chunks(len(index), lambda cut: values[index[cut]])

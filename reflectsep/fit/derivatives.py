@@ -161,7 +161,7 @@ def alpha_columns(
     """
     pull, root, body, shine = known
     g = unpack_globals(shared, obs.n_d)
-    own = torch.tensor(obs.swept or [False] * len(obs.alpha))[3:, None]
+    own = torch.tensor(obs.swept or [False] * len(obs.alpha), device=obs.images.device)[3:, None]
     s = obs.s_basis if x.s is None else x.s
     mixed_root = (x.d + s)[:, :, None] - torch.where(own, obs.s_basis[:, :, None], 0.0)
     lobe_root = g.a + x.B[:, None] * x.d.mean(1)
@@ -211,7 +211,7 @@ def fill_priors(
     along = (whole * s).sum(-1, keepdim=True) / power
     by_d = s / power
     by_s = (whole + s - 2.0 * along * s) / power
-    eye = torch.eye(3, dtype=s.dtype)
+    eye = torch.eye(3, dtype=s.dtype, device=s.device)
     off_d = eye - s[..., :, None] * by_d[..., None, :]
     off_s = off_d if x.s is None else (1.0 - along[..., None]) * eye - s[..., :, None] * by_s[..., None, :]
     weight, mean_weight = priors.parallel[:, None, None], (priors.ratio_weight / channels)[:, None]

@@ -54,6 +54,16 @@ VISIBLE = 3.0
 """A lobe counts as seen where it exceeds this many standard deviations of the noise."""
 
 
+def quantile(values: Float[Tensor, "pixels"], share: float) -> float:
+    """The value that `share` of the others stay below, interpolated; torch's own takes 16 million values at most."""
+    rank = share * (len(values) - 1)
+    low = int(rank)
+    below = values.kthvalue(low + 1).values
+    if low == rank:
+        return float(below)
+    return float(torch.lerp(below, values.kthvalue(low + 2).values, rank - low))
+
+
 def near_maximum(values: Float[Tensor, "pixels"]) -> float:
     """The 99.9 % quantile, of some hundred thousand of the pixels at most."""
     return float(torch.quantile(values[:: max(1, len(values) // 100_000)], 0.999))
@@ -103,7 +113,7 @@ def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], si
         shape=1.0 / (SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD),
         height=HEIGHT_FACTOR * max(highest, 5.0 * sigma),
     )
-    power = obs.s_basis.square().sum((1, 2))
+    power = in_chunks(len(obs), lambda cut: obs.s_basis[cut].square().sum((1, 2)))
     if not bool((power > 0).any()):
         return priors
     return replace(priors, parallel=parallel_weight(obs, parallel_spread(obs, body), sigma))
@@ -126,7 +136,7 @@ def parallel_spread(obs: Observations, body: Float[Tensor, "pixels channels 3"])
 
 def parallel_weight(obs: Observations, spread: float, sigma: float) -> Float[Tensor, "pixels"]:
     """Weight of `d + s parallel to s` for a scatter of `spread`; 0 where that is no rule of this object."""
-    size = obs.s_basis.square().sum(-1).sqrt().mean(-1)
+    size = in_chunks(len(obs), lambda cut: obs.s_basis[cut].square().sum(-1).sqrt().mean(-1))
     if spread > PARALLEL_SD_MOST:
         return torch.zeros_like(size)
     return 1.0 / (max(spread, PARALLEL_SD_LEAST) * size + 0.1 * sigma)
@@ -145,7 +155,7 @@ def with_ratio(
     robust body: in the present fit, patches in a wrong minimum would pass for another material and never be mended.
     """
     s = obs.s_basis
-    power = s.square().sum(-1).mean(-1)
+    power = in_chunks(len(s), lambda cut: s[cut].square().sum(-1).mean(-1))
     bright = power > 0.01 * power.max()
     if not bool(bright.any()):
         return priors
@@ -162,7 +172,12 @@ def with_ratio(
 
 def ratio_to(whole: Float[Tensor, "pixels channels 3"], s: Float[Tensor, "pixels channels 3"]) -> Tensor:
     """(d + s) . s / s . s, mean over channels."""
-    return ((whole * s).sum(-1) / s.square().sum(-1).clamp_min(1e-9)).mean(-1)
+
+    def ratio(cut: slice) -> Tensor:
+        part = s[cut]
+        return ((whole[cut] * part).sum(-1) / part.square().sum(-1).clamp_min(1e-9)).mean(-1)
+
+    return in_chunks(len(s), ratio)
 
 
 def one_material(
@@ -192,35 +207,47 @@ def with_facing(
     Where scattering is nearly all of a pixel's light, d = whole - s has the direction of its error, and a lobe that no
     picture of the basis sees shines in the pictures of other lights.
     """
-    whole = (x.d + (obs.s_basis if x.s is None else x.s)).mean(1)
-    size = whole.norm(dim=-1).clamp_min(1e-9)
-    facing = whole / size[:, None]
-    v = normalised_lobe(x, shared)
+    body = obs.s_basis if x.s is None else x.s
+    whole = in_chunks(len(obs), lambda cut: (x.d[cut] + body[cut]).mean(1))
+    size = in_chunks(len(obs), lambda cut: whole[cut].norm(dim=-1).clamp_min(1e-9))
+    facing = in_chunks(len(obs), lambda cut: whole[cut] / size[cut, None])
+
+    def off(cut: slice) -> Tensor:
+        v = normalised_lobe(x.take(cut), shared)
+        return across(v, facing[cut]).norm(dim=-1) / v.norm(dim=-1).clamp_min(1e-9)
+
     seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
     spread = FACING_SD
     if int(seen.sum()) >= LEAST_SEEN:
-        off = across(v, facing).norm(dim=-1) / v.norm(dim=-1).clamp_min(1e-9)
-        spread = min(max(float(off[seen].median()) / RAYLEIGH, FACING_SD_LEAST), FACING_SD)
-    # The length of the lobe by its geometry, from the same normal.
-    length = size * (-log_shape(whole, obs.normal_map, obs.view, obs.lights_known)).exp()
-    calm = torch.nn.functional.normalize(smooth(facing, size, mask, FACING_SIGMA_PX), dim=-1)
-    bent = (facing - calm).square().sum(-1) / 2.0
-    weight = 1.0 / (length * (spread**2 + bent + (sigma / size).square()).sqrt()).clamp_min(1e-3)
-    lit = whole.mean(-1) > 2.0 * sigma
-    return replace(priors, facing=facing, facing_weight=torch.where(lit, weight, 0.0))
+        spread = min(max(float(in_chunks(len(obs), off)[seen].median()) / RAYLEIGH, FACING_SD_LEAST), FACING_SD)
+    calm = smooth(facing, size, mask, FACING_SIGMA_PX)
+
+    def weight(cut: slice) -> Tensor:
+        # The length of the lobe by its geometry, from the same normal.
+        length = size[cut] * (-log_shape(whole[cut], obs.normal_map, obs.view, obs.lights_known)).exp()
+        # One coordinate after the other, as maps are: sums in another order round otherwise.
+        around = torch.nn.functional.normalize(calm[cut].T.contiguous().T, dim=-1)
+        bent = (facing[cut] - around).square().sum(-1) / 2.0
+        firm = 1.0 / (length * (spread**2 + bent + (sigma / size[cut]).square()).sqrt()).clamp_min(1e-3)
+        return torch.where(whole[cut].mean(-1) > 2.0 * sigma, firm, 0.0)
+
+    return replace(priors, facing=facing, facing_weight=in_chunks(len(obs), weight))
 
 
 def shape_spread(
     obs: Observations, local: Tensor, shared: Tensor, shine: Float[Tensor, "pixels lights"], sigma: float
 ) -> float:
     """Scatter of log B about its geometric value over the pixels whose lobe is well seen."""
-    x = unpack(local, obs.channels)
-    row = shape_row(x.log_B, x.d.mean(-2), shared, obs)
+
+    def rows(cut: slice) -> Tensor:
+        x = unpack(local[cut], obs.channels)
+        return shape_row(x.log_B, x.d.mean(-2), shared, obs)
+
     # Well seen: in two pictures or more, and well above the noise.
     seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
     first = SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD
     if int(seen.sum()) < LEAST_SEEN:
         return first
-    values = row[seen]
+    values = in_chunks(len(local), rows)[seen]
     spread = MAD_TO_SD * float((values - values.median()).abs().median())
     return min(max(spread, SHAPE_SD_LEAST), first)

@@ -7,6 +7,8 @@ neighbours would have a pixel be is a regression over them that leaves the pixel
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Bool, Float
 from kornia.filters import gaussian_blur2d
@@ -14,9 +16,12 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad, unfold
 
 from reflectsep.fit.chunks import in_chunks
+from reflectsep.room import rows
 
 MAD_TO_SD = 1.4826
-PIXELS_OF_A_BAND = 1 << 16
+PIXELS_OF_WINDOWS = 1 << 16
+PIXELS_OF_A_BAND = 1 << 18
+"""Of the frame, at once: of a quadratic surface some hundred megabytes are in between."""
 QUADRATIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 """Powers of x and y of a quadratic surface."""
 
@@ -35,11 +40,16 @@ def smooth(
     sigma_px: float,
 ) -> Float[Tensor, "pixels channels"]:
     """Gaussian mean over the pixels of the mask, each counted by its weight (normalised convolution)."""
-    reach = 2 * max(1, round(3 * sigma_px)) + 1
-    blur = lambda p: gaussian_blur2d(p[None], (reach, reach), (sigma_px, sigma_px), "constant")[0]  # noqa: E731
-    total = blur(to_map(values * weight[:, None], mask))
-    count = blur(to_map(weight[:, None], mask))
-    return (total / count.clamp_min(1e-12))[:, mask].T
+    reach = max(1, round(3 * sigma_px))
+    window, sigma = (2 * reach + 1, 2 * reach + 1), (sigma_px, sigma_px)
+    blurred = lambda p: gaussian_blur2d(p[None], window, sigma, "constant")[0]  # noqa: E731
+
+    def mean(pixels: slice, part: Tensor, wanted: Tensor) -> Tensor:
+        total = blurred(to_map(values[pixels] * weight[pixels, None], part))
+        count = blurred(to_map(weight[pixels, None], part))
+        return (total / count.clamp_min(1e-12))[:, part].T[wanted]
+
+    return in_bands(mask, reach, PIXELS_OF_A_BAND, mean)
 
 
 def neighbourhood(
@@ -58,20 +68,41 @@ def local_median(
     values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"], radius: int
 ) -> Float[Tensor, "pixels channels"]:
     """Median of the neighbours, channel by channel; a pixel without neighbours keeps its own value."""
-    result, (height, width), at = torch.empty_like(values), mask.shape, 0
-    band = max(1, PIXELS_OF_A_BAND // width)
-    before = mask.sum(1).cumsum(0).tolist()
-    # Band by band, with the rows that its windows reach into: the windows are far larger than the picture.
+
+    def median(pixels: slice, part: Tensor, wanted: Tensor) -> Tensor:
+        own = values[pixels]
+        found = neighbourhood(own, part, radius)[wanted].nanmedian(-1).values
+        return torch.where(found.isfinite(), found, own[wanted])
+
+    # The windows are far larger than the picture.
+    return in_bands(mask, radius, PIXELS_OF_WINDOWS, median)
+
+
+def in_bands(
+    mask: Bool[Tensor, "height width"], reach: int, at_once: int, work: Callable[[slice, Tensor, Tensor], Tensor]
+) -> Tensor:
+    """Rows of the picture some at a time, each time with the rows beside them that windows reach into.
+
+    `work` has the band's pixels as a slice of the mask's, its part of the mask, and which of these pixels are wanted;
+    it gives these one row each.
+    """
+    height, width = mask.shape
+    band = max(1, at_once // width)
+    before = [0, *mask.sum(1).cumsum(0).tolist()]
+    result: Tensor | None = None
     for top in range(0, height, band):
-        first, last = max(0, top - radius), min(height, top + band + radius)
-        pixels = slice(before[first - 1] if first else 0, before[last - 1])
-        wanted = torch.zeros_like(mask[first:last])
-        wanted[top - first : top - first + band] = True
-        windows = neighbourhood(values[pixels], mask[first:last], radius)[wanted[mask[first:last]]]
-        end = before[min(top + band, height) - 1]
-        result[at:end] = windows.nanmedian(-1).values
-        at = end
-    return torch.where(result.isfinite(), result, values)
+        end = min(top + band, height)
+        if before[top] == before[end] and (result is not None or end < height):
+            continue
+        first, last = max(0, top - reach), min(height, end + reach)
+        within = torch.zeros_like(mask[first:last])
+        within[top - first : end - first] = True
+        part = work(slice(before[first], before[last]), mask[first:last], within[mask[first:last]])
+        if result is None:
+            result = rows(before[-1], part)
+        result[before[top] : before[end]] = part
+    assert result is not None  # a picture has rows
+    return result
 
 
 def local_quadratic(
@@ -85,6 +116,17 @@ def local_quadratic(
     A quadratic surface through the others, by least squares under a Gaussian window: a mean would flatten whatever is
     curved, and a curved surface is what a highlight lies on.
     """
+    reach = max(1, round(3 * sigma_px))
+
+    def predicted(pixels: slice, part: Tensor, wanted: Tensor) -> Tensor:
+        return _quadratic(values[pixels], weight[pixels], part, sigma_px)[wanted]
+
+    found = in_bands(mask, reach, PIXELS_OF_A_BAND, predicted)
+    return found[:, :-1], found[:, -1]
+
+
+def _quadratic(values: Tensor, weight: Tensor, mask: Tensor, sigma_px: float) -> Float[Tensor, "pixels channels+1"]:
+    """`local_quadratic` of one band: predictions and, last, their variance."""
     reach = max(1, round(3 * sigma_px))
     along = torch.arange(-reach, reach + 1, dtype=values.dtype) / sigma_px
     window = torch.exp(-0.5 * along.square())
@@ -122,5 +164,4 @@ def local_quadratic(
         surface = (inverse @ (right[cut] * unit[:, :, None])) * unit[:, :, None]
         return torch.cat([surface[:, 0], (inverse[:, 0, 0] * unit[:, 0].square())[:, None]], -1)
 
-    found = in_chunks(len(values), centre)
-    return found[:, :-1], found[:, -1]
+    return in_chunks(len(values), centre)

@@ -42,3 +42,5 @@ class FitOptions:
     chunk: int = 1 << 12
     """Pixels times channels at once: what stays in the cache is twice as fast as what does not."""
     dtype: Literal["float32", "float64"] = "float64"
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where chunks are searched and solved; what is kept of all pixels, and all other work, is the processor's."""

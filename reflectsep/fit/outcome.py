@@ -23,6 +23,7 @@ from reflectsep.fit.problem import (
 from reflectsep.fit.solution import lobe_pictures
 from reflectsep.fit.state import State
 from reflectsep.flags import Flag, mark
+from reflectsep.room import empty
 from reflectsep.solve.joint import inverse, reduced_system
 from reflectsep.solve.local import normal_equations
 from reflectsep.solve.problem import robust_weight
@@ -98,8 +99,10 @@ def refined_alpha(
 
 def to_picture(values: Float[Tensor, "pixels channels maps"], mask: Tensor) -> Float[Tensor, "maps channels h w"]:
     """Values of the fitted pixels as pictures, float32."""
-    picture = values.new_zeros(values.shape[2], values.shape[1], *mask.shape, dtype=torch.float32)
-    picture[..., mask] = values.permute(2, 1, 0).float()
+    picture = empty(values.shape[2], values.shape[1], *mask.shape, dtype=torch.float32).zero_()
+    for k, channels in enumerate(picture):
+        for c, plane in enumerate(channels):
+            plane[mask] = values[:, c, k].float()
     return picture
 
 
@@ -163,11 +166,12 @@ def final_flags(
         return torch.where(obs.clipped[cut], found.clamp_max(0.0), found).abs().amax((1, 2))
 
     unlike = in_chunks(len(obs), misfit) > OUTLIER * state.sigma
+    dark = in_chunks(len(obs), lambda cut: (x.d[cut].mean(1) < 0).any(-1))
     marks = {
         Flag.FAINT_LOBE: shine < 3.0 * state.sigma,
         Flag.NOT_CONVERGED: ~found.converged,
         Flag.AMBIGUOUS: found.runner_up < found.cost + AMBIGUOUS_COST,
-        Flag.ATTACHED_SHADOW: (x.d.mean(1) < 0).any(-1),
+        Flag.ATTACHED_SHADOW: dark,
         Flag.SHADOW_OR_OUTLIER: unlike,
         Flag.UNDEREXPOSED: obs.images[..., :3].amax((1, 2)) < 3.0 * state.sigma,
     }

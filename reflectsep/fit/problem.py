@@ -15,7 +15,8 @@ Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,6 +29,8 @@ SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haz
 LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
 ALPHA = len(SHARED_NAMES)
 """Where what is added to the stated alphas begins, if they are refined."""
+
+Moved = TypeVar("Moved", "Observations", "Priors")
 
 LEAST_LOG_N_S = 1.4
 """log of 4: a broader lobe is no highlight but diffuse light that the diffuse part has not explained."""
@@ -62,6 +65,8 @@ class Observations:
     """Of every light: its s was measured, not mixed; empty: only those of the basis."""
     s_unknown: bool = False
     """The scattering roots of the basis lights are local unknowns too."""
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    """Where chunks of pixels are searched and solved."""
 
     def __len__(self) -> int:
         """Number of pixels."""
@@ -86,6 +91,10 @@ class Observations:
             weight=self.weight[index],
             clipped=self.clipped[index],
         )
+
+    def there(self) -> Observations:
+        """The same on the device where it is to be worked on."""
+        return moved(self, self.device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,6 +151,11 @@ class Priors:
         )
 
 
+def moved(values: Moved, device: torch.device) -> Moved:
+    """Observations or priors with their tensors on a device."""
+    return replace(values, **{k: v.to(device) for k, v in vars(values).items() if isinstance(v, Tensor)})
+
+
 def no_priors(pixels: int, like: Tensor) -> Priors:
     """Priors whose rows of single pixels are all switched off."""
     zero = like.new_zeros(pixels)
@@ -171,6 +185,10 @@ class Locals:
     def B(self) -> Float[Tensor, "pixels"]:  # noqa: N802  (the paper's symbol)
         """The lobe's factor."""
         return self.log_B.exp()
+
+    def take(self, index: Tensor | slice) -> Locals:
+        """Some of the pixels."""
+        return Locals(self.d[index], self.log_B[index], None if self.s is None else self.s[index])
 
     def pack(self) -> Float[Tensor, "pixels P"]:
         """As one row a pixel."""
@@ -204,14 +222,14 @@ def refined(obs: Observations, shared: Float[Tensor, "G"]) -> Observations:
     if len(shared) == ALPHA:
         return obs
     mixed = mixing_of(obs, shared)
-    own = torch.tensor(obs.swept or [False] * len(obs.alpha))
-    moved = obs.s_basis @ (mixed.alpha - obs.alpha).mT
+    own = torch.tensor(obs.swept or [False] * len(obs.alpha), device=obs.images.device)
+    change = obs.s_basis @ (mixed.alpha - obs.alpha).mT
     return replace(
         obs,
         alpha=mixed.alpha,
         images=obs.images / mixed.intensity,
         weight=obs.weight * mixed.intensity,
-        s=obs.s + torch.where(own, 0.0, moved),
+        s=obs.s + torch.where(own, 0.0, change),
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,18 +18,19 @@ from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.body import extend_into_shadow, robust_body
-from reflectsep.fit.chunks import in_chunks
+from reflectsep.fit.chunks import cuts, in_chunks, taken
 from reflectsep.fit.expectations import (
     first_priors,
     near_maximum,
     noise_of,
+    quantile,
     shape_spread,
     unknowns_in_effect,
     with_facing,
     with_ratio,
 )
 from reflectsep.fit.options import FitOptions
-from reflectsep.fit.outcome import describe, picture_residual
+from reflectsep.fit.outcome import describe, picture_residual, shine_of
 from reflectsep.fit.problem import (
     ALPHA,
     LOG_C_2,
@@ -55,6 +57,7 @@ from reflectsep.fit.state import State
 from reflectsep.flags import Flag
 from reflectsep.model import diffuse
 from reflectsep.progress import Progress, silent
+from reflectsep.room import empty
 from reflectsep.solve.joint import JointOptions, costs_in_chunks
 from reflectsep.solve.local import Termination
 
@@ -125,7 +128,7 @@ def observe(
         raise FitError("the pictures have no contrast inside the mask")
     use = scattering is not None and options.scattering != "none"
     n_d = scattering.n_d if use and scattering is not None else 1.0
-    s = torch.zeros_like(images)
+    s = images.new_zeros(()).expand_as(images)
     if use and scattering is not None:
         s = flattened(scattering.root, mask, intensity ** (1.0 / n_d))
     obs = Observations(
@@ -143,6 +146,7 @@ def observe(
         n_d_sd=max(scattering.n_d_sd / n_d, N_D_SD_LEAST) if use and scattering is not None else N_D_SD,
         swept=scattering.measured if use and scattering is not None else (),
         s_unknown=options.scattering == "unknown" or (use and options.scattering_sd > 0),
+        device=torch.device(options.device),
     )
     return obs, mask, intensity
 
@@ -152,10 +156,11 @@ def flattened(
 ) -> Tensor:
     """Pictures (lights, channels, height, width) as (pixels, channels, lights), divided light by light."""
     kind = pictures.dtype if divisor is None else divisor.dtype
-    result = torch.empty(int(mask.sum()), pictures.shape[1], len(pictures), dtype=kind)
+    result = empty(int(mask.sum()), pictures.shape[1], len(pictures), dtype=kind)
     for j, picture in enumerate(pictures):
-        values = picture[:, mask].to(kind).T
-        result[..., j] = values if divisor is None else values / divisor[j]
+        for c, plane in enumerate(picture):
+            values = plane[mask].to(kind)
+            result[:, c, j] = values if divisor is None else values / divisor[j]
     return result
 
 
@@ -231,7 +236,8 @@ def beyond_the_edge(
 
 def scattering_weight(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels"]:
     """1 / standard deviation of the measured s: that of the method, and the noise of its frames."""
-    return 1.0 / (options.scattering_sd * obs.s_basis.square().mean((1, 2)).sqrt() + sigma)
+    size = in_chunks(len(obs), lambda cut: obs.s_basis[cut].square().mean((1, 2)).sqrt())
+    return 1.0 / (options.scattering_sd * size + sigma)
 
 
 def weights(obs: Observations, options: FitOptions, sigma: float) -> Float[Tensor, "pixels channels lights"]:
@@ -277,9 +283,9 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
     state = with_noise_of_fit(replace(state, found=found), options)
     if options.prior == "auto" and obs.lights_known:
         # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
-        vote = (state.found.cost <= state.found.cost.quantile(effort.trim)).nonzero()[:, 0]
+        vote = (state.found.cost <= quantile(state.found.cost, effort.trim)).nonzero()[:, 0]
         shine = in_chunks(len(vote), lambda cut: lobe_pictures(obs, state.found.local[vote[cut]], state.shared))
-        spread = shape_spread(obs, state.found.local[vote], state.shared, shine, state.sigma)
+        spread = shape_spread(obs, taken(state.found.local, vote), state.shared, shine, state.sigma)
         shape = max(state.priors.shape, 1.0 / spread)
         state = rescored(replace(state, priors=replace(state.priors, shape=shape)))
     return state
@@ -313,9 +319,10 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
     if bool((state.priors.parallel > 0).any()):
         for i in range(2):
             x = unpack(state.found.local, state.obs.channels)
-            whole = x.d + (state.obs.s_basis if x.s is None else x.s)
+            s = state.obs.s_basis if x.s is None else x.s
+            whole = in_chunks(len(s), lambda cut, d=x.d, s=s: d[cut] + s[cut])
             priors = with_ratio(state.priors, state.obs, whole, state.body, state.mask)
-            shine = lobe_pictures(state.obs, state.found.local, state.shared)
+            shine = in_chunks(len(s), partial(shine_of, state))
             priors = with_facing(priors, state.obs, x, state.shared, shine, state.sigma, state.mask)
             state = rescored(replace(state, priors=priors))
             state = joint_step(hand_on(state, 1), f"neighbourhood {i + 1} of 2", progress)
@@ -330,7 +337,8 @@ def smooth_lobes(state: State, options: FitOptions, progress: Progress) -> State
         if prediction is None:
             continue
         state = rescored(replace(state, priors=with_lobe(state.priors, prediction)))
-        vector = prediction.lobe * state.shared[LOG_C_2].exp()
+        C_2 = state.shared[LOG_C_2].exp()
+        vector = in_chunks(len(state.obs), lambda cut, p=prediction.lobe, C_2=C_2: p[cut] * C_2)
         found = offer_lobes(state.obs, state.priors, state.found, state.shared, vector, state.effort, state.robust)
         state = joint_step(rescored(replace(state, found=found)), f"smooth lobes {i + 1} of {len(scales)}", progress)
     return state
@@ -384,7 +392,7 @@ def try_extensions(state: State, options: FitOptions, progress: Progress) -> Sta
     shared, free = state.shared.clone(), state.free.clone()
     if options.lobe == "haze":
         shared[ROOT_HAZE], free[ROOT_HAZE] = 0.2, True
-    if bool((state.obs.s != 0).any()):
+    if any(bool((state.obs.s[cut] != 0).any()) for cut in cuts(len(state.obs))):
         shared[SOFTNESS], free[SOFTNESS] = 0.12, True
     if bool((free == state.free).all()):
         return state

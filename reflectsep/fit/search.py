@@ -122,7 +122,7 @@ def scan(
     width = edge_width(mean.s_basis, shared[SOFTNESS])[:, 0]
     first = (signed_root(target[:, :3], float(globals_.n_d)) - s[:, :3]).clamp_min(1e-4)
     centre = shared[LOG_C_2] - log_shape(first, obs.normal_map, obs.view, obs.lights_known)
-    log_B = centre[:, None] + torch.linspace(*span, values, dtype=target.dtype)
+    log_B = centre[:, None] + torch.linspace(*span, values, dtype=target.dtype, device=target.device)
     B = log_B.exp()
     d = basis_roots(target[:, None, :3], s[:, None, :3], B[..., None], globals_, width[:, None])
     model = reflectance(
@@ -136,7 +136,7 @@ def scan(
     ends = torch.nn.functional.pad(cost, (1, 1), value=torch.inf)
     minimum = (cost <= ends[:, :-2]) & (cost <= ends[:, 2:])
     best, index = torch.where(minimum, cost, torch.inf).topk(keep, largest=False, dim=1)
-    row = torch.arange(len(obs))[:, None]
+    row = torch.arange(len(obs), device=target.device)[:, None]
     return Candidates(
         d=colour_roots(obs, d[row, index], log_B[row, index].exp(), globals_),
         log_B=log_B[row, index],

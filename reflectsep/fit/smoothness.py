@@ -95,7 +95,8 @@ def predict(state: State, scale_px: float, spread: float | None = None) -> Predi
 
     Neighbours count by their certainty, and less the farther they are from what their own neighbours say.
     """
-    lobe = normalised_lobe(unpack(state.found.local, state.obs.channels), state.shared)
+    x = unpack(state.found.local, state.obs.channels)
+    lobe = in_chunks(len(state.obs), lambda cut: normalised_lobe(x.take(cut), state.shared))
     own = lobe_variance(state)
     seen = clearly_seen(state, own)
     if spread is None and int(seen.sum()) < LEAST_SEEN:
@@ -105,7 +106,7 @@ def predict(state: State, scale_px: float, spread: float | None = None) -> Predi
     predicted, variance = lobe, own
     for _ in range(4):
         predicted, variance = local_quadratic(lobe, trust / (own + square), state.mask, scale_px)
-        error = (lobe - predicted).square().mean(-1)
+        error = in_chunks(len(lobe), lambda cut, p=predicted: (lobe[cut] - p[cut]).square().mean(-1))
         if spread is None:
             total = float(error[seen].median()) / MEDIAN_OF_CHI_SQUARED
             square = max(total - float(own[seen].median()), LEAST_SD**2)
@@ -134,9 +135,10 @@ def scales_of(state: State) -> list[tuple[float, float]]:
 def with_lobe(priors: Priors, prediction: Prediction) -> Priors:
     """`priors` with the lobe row."""
     weight = (prediction.spread**2 + prediction.variance).rsqrt()
-    sound = weight.isfinite() & prediction.lobe.isfinite().all(-1)
+    told = in_chunks(len(weight), lambda cut: prediction.lobe[cut].isfinite().all(-1))
+    sound = weight.isfinite() & told
     return replace(
         priors,
-        lobe=torch.where(sound[:, None], prediction.lobe, 0.0),
+        lobe=in_chunks(len(weight), lambda cut: torch.where(sound[cut, None], prediction.lobe[cut], 0.0)),
         lobe_weight=torch.where(sound, weight, 0.0),
     )

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reflectsep.fit.blocks import build_problem
-from reflectsep.fit.chunks import in_chunks
+from reflectsep.fit.chunks import cuts, in_chunks, taken
 from reflectsep.fit.neighbours import local_median
 from reflectsep.fit.problem import (
     LOG_N_D,
@@ -21,12 +21,14 @@ from reflectsep.fit.problem import (
     Observations,
     Priors,
     alpha_of,
+    moved,
     refined,
     unpack,
     unpack_globals,
 )
 from reflectsep.fit.search import scan
 from reflectsep.model import lobe, lobe_argument, signed_root
+from reflectsep.room import copied
 from reflectsep.solve.joint import JointOptions, JointSolution, local_in_chunks, solve_joint
 from reflectsep.solve.local import Termination
 from reflectsep.solve.sharing import by_chunks
@@ -78,8 +80,10 @@ def fit_locals(
 
     def fitted(cut: slice) -> tuple[Tensor, ...]:
         index = torch.arange(cut.start, cut.stop)
-        part = fit_chunk(obs.take(index), priors.take(index), shared, effort, robust)
-        return part.local, part.cost, part.runner_up, part.converged
+        there = obs.take(index).there(), moved(priors.take(index), obs.device), shared.to(obs.device)
+        part = fit_chunk(*there, effort, robust)
+        found = part.local, part.cost, part.runner_up, part.converged
+        return tuple(each.to(shared.device) for each in found)
 
     return LocalFit(*by_chunks(len(obs), effort.chunk, fitted))
 
@@ -114,17 +118,25 @@ def merge(
     if best is None:
         empty = local.new_full((pixels,), torch.inf)
         best = LocalFit(local.new_zeros(pixels, local.shape[1]), empty, empty.clone(), empty.isnan())
-    old, new_cost = best.cost[which], cost.nan_to_num(nan=torch.inf)
-    better = new_cost < old
-    other = (local - best.local[which]).abs().amax(-1) > 0.02 * local.abs().amax(-1)
-    loser = torch.where(better, old, new_cost)
-    runner_up = torch.where(other, torch.minimum(best.runner_up[which], loser), best.runner_up[which])
-    result = LocalFit(best.local.clone(), best.cost.clone(), best.runner_up.clone(), best.converged.clone())
-    result.local[which] = torch.where(better[:, None], local, best.local[which])
-    result.cost[which] = torch.where(better, new_cost, old)
-    result.runner_up[which] = runner_up
-    result.converged[which] = torch.where(better, converged, best.converged[which])
+    result = LocalFit(copied(best.local), best.cost.clone(), best.runner_up.clone(), best.converged.clone())
+    for cut in cuts(len(which)):
+        _merge_some(result, best, which[cut], local[cut], cost[cut], converged[cut])
     return result
+
+
+def _merge_some(
+    result: LocalFit, best: LocalFit, which: Tensor, local: Tensor, cost: Tensor, converged: Tensor
+) -> None:
+    """`merge` at some of the pixels."""
+    old, new_cost, before = best.cost[which], cost.nan_to_num(nan=torch.inf), best.local[which]
+    better = new_cost < old
+    other = (local - before).abs().amax(-1) > 0.02 * local.abs().amax(-1)
+    loser = torch.where(better, old, new_cost)
+    result.local[which] = torch.where(better[:, None], local, before)
+    result.cost[which] = torch.where(better, new_cost, old)
+    runner_up = best.runner_up[which]
+    result.runner_up[which] = torch.where(other, torch.minimum(runner_up, loser), runner_up)
+    result.converged[which] = torch.where(better, converged, best.converged[which])
 
 
 def fit_globals(
@@ -150,10 +162,10 @@ def fit_globals(
             keep = found.cost.argsort()[:number]
             problem = build_problem(obs.take(keep), priors.take(keep), robust=robust)
             joint = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
-            moved = float((joint.shared - shared).abs().max())
+            step = float((joint.shared - shared).abs().max())
             shared = joint.shared
             way.append(shared)
-            if moved < 1e-3 or met(shared, passed):
+            if step < 1e-3 or met(shared, passed):
                 break
         if not met(shared, passed):
             found = fit_locals(obs, priors, shared, effort, robust)
@@ -187,13 +199,13 @@ def fit_everything(
     joint = solve_joint(
         problem.take(vote), found.local[vote], shared, effort.joint, free=free, watch=lambda i, _: report(i, total)
     )
-    local, settled = found.local.clone(), found.converged.clone()
+    local, settled = copied(found.local), found.converged.clone()
     local[vote], settled[vote] = joint.local, joint.settled
     rest = torch.ones(len(obs), dtype=torch.bool)
     rest[vote] = False
     index = rest.nonzero()[:, 0]
     if len(index):
-        others = local_in_chunks(problem, local[index], joint.shared, effort.polish, effort.chunk, index)
+        others = local_in_chunks(problem, taken(local, index), joint.shared, effort.polish, effort.chunk, index)
         local[index], settled[index] = others.local, others.converged
     return replace(joint, local=local, settled=settled)
 
@@ -214,7 +226,8 @@ def hand_on_lobes(
     A lobe B d is a matter of shape alone, so neighbours share it whatever their albedo.
     """
     x = unpack(found.local, obs.channels)
-    lobe_vector = local_median(x.B[:, None] * x.d.mean(1), mask, radius)
+    own = in_chunks(len(obs), lambda cut: x.B[cut, None] * x.d[cut].mean(1))
+    lobe_vector = local_median(own, mask, radius)
     return offer_lobes(obs, priors, found, shared, lobe_vector, effort, robust)
 
 

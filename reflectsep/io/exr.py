@@ -80,7 +80,7 @@ def write_channels(
             raise ValueError(f"{path}: channel {name} has shape {array.shape}, a 2-D one as of the first was expected")
         if array.dtype not in _TYPES:
             raise ValueError(f"{path}: channel {name} is {array.dtype}; float16, float32 or uint32 was expected")
-        pixels[name] = np.array(array, order="C", copy=True)
+        pixels[name] = np.ascontiguousarray(array)
     header: dict[str, Any] = {key: _builtin(value) for key, value in (attributes or {}).items()}
     header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 

@@ -14,6 +14,7 @@ from reflectsep.errors import CaptureError
 from reflectsep.io.capture import checksum
 from reflectsep.io.files import inside
 from reflectsep.io.pictures import read_picture
+from reflectsep.room import empty
 
 SAME_EXPOSURE = 0.01
 """Relative difference up to which two exposures are the same."""
@@ -36,18 +37,21 @@ def read_full(capture: Capture) -> RawPictures:
     Raises:
         CaptureError: a picture that cannot be read, of another size or number of channels, or all zero.
     """
-    values: list[Tensor] = []
-    saturated: list[Tensor] = []
-    for name in capture.names:
-        picture, clipped = _read(capture, capture.full(name).file, values[0] if values else None)
+    values = saturated = None
+    for i, name in enumerate(capture.names):
+        picture, clipped = _read(capture, capture.full(name).file, None if values is None else values[0])
         if not picture.nan_to_num().any():
             raise CaptureError(f"{capture.folder / capture.full(name).file}: every pixel is zero; no light was on?")
-        values.append(picture)
-        saturated.append(clipped)
+        if values is None or saturated is None:
+            values = empty(len(capture.names), *picture.shape, dtype=picture.dtype)
+            saturated = empty(len(capture.names), *clipped.shape, dtype=clipped.dtype)
+        values[i], saturated[i] = picture, clipped
+    assert values is not None  # a capture has lights
+    assert saturated is not None
     return RawPictures(
         names=capture.names,
-        values=torch.stack(values),
-        saturated=torch.stack(saturated),
+        values=values,
+        saturated=saturated,
         exposure_s=tuple(capture.full(name).exposure_s for name in capture.names),
     )
 

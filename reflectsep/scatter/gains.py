@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.data import PhotometricStack
+from reflectsep.room import empty, stacked
 from reflectsep.scatter.exponent import GRID, UNKNOWN_SD, Exponent, Samples, complete, solve_exponent
 from reflectsep.scatter.frames import name_of
 from reflectsep.scatter.local import box_sum
@@ -46,8 +47,10 @@ def choose_samples(stack: PhotometricStack, lights: Sequence[int]) -> list[Bool[
 
     A pixel is chosen by its neighbours, never by its own noise: leaving out the brightest would bend Eq. 25.
     """
-    near = torch.stack([_around(picture, stack.mask) for picture in stack.images])
-    typical = near.median(0).values
+    near = stacked((_around(picture, stack.mask) for picture in stack.images), len(stack.images))
+    typical = empty(*near.shape[1:], dtype=near.dtype)
+    for row in range(near.shape[2]):
+        typical[:, row] = near[:, :, row].median(0).values
     chosen = {k: _chosen(stack, k, near[k], typical) for k in set(lights)}
     return [chosen[k] for k in lights]
 
@@ -157,9 +160,13 @@ def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tens
 def _around(full: Float[Tensor, "channels height width"], mask: Bool[Tensor, "height width"]) -> Tensor:
     """Mean over the 5 x 5 neighbours on the object, the pixel itself left out."""
     weight = mask.to(full)
-    values = box_sum(full * weight) - full * weight
-    count = box_sum(weight[None]) - weight
-    return torch.where(count > 0.5, values / count.clamp(min=0.5), full)
+    count = box_sum(weight[None])[0] - weight
+    result = torch.empty_like(full)
+    for c, channel in enumerate(full):
+        own = channel * weight
+        values = box_sum(own[None])[0] - own
+        result[c] = torch.where(count > 0.5, values / count.clamp(min=0.5), channel)
+    return result
 
 
 def fine_noise(full: Tensor, mask: Tensor) -> float:

@@ -17,6 +17,7 @@ from reflectsep.data import PhotometricStack
 LEAST = 0.25
 SHADED = 0.12
 """Values below this share of a pixel's brightest picture are taken for attached shadow."""
+PIXELS_AT_ONCE = 1 << 16
 
 
 def crude_normals(stack: PhotometricStack) -> Float[Tensor, "height width 3"] | None:
@@ -26,19 +27,26 @@ def crude_normals(stack: PhotometricStack) -> Float[Tensor, "height width 3"] | 
     """
     if stack.light_vectors is None:
         return None
-    grey = stack.images.mean(1)[:, stack.mask].T
+    result = torch.zeros(*stack.mask.shape, 3)
+    result[..., 2] = 1.0
+    where = stack.mask.nonzero()
+    for some in where.split(PIXELS_AT_ONCE):
+        rows, columns = some.unbind(1)
+        grey = torch.stack([picture[:, rows, columns].mean(0) for picture in stack.images], -1)
+        result[rows, columns] = _normals(grey, stack.light_vectors.to(grey))
+    return result
+
+
+def _normals(grey: Float[Tensor, "pixels lights"], L: Float[Tensor, "lights 3"]) -> Float[Tensor, "pixels 3"]:
+    """Of some pixels."""
     use = grey > SHADED * grey.amax(1, keepdim=True)
     if grey.shape[1] > 4:
         brightest = torch.nn.functional.one_hot(grey.argmax(1), grey.shape[1]).bool()
         use &= ~(brightest & (use.sum(1, keepdim=True) > 4))
     weight = use.to(grey)
-    L = stack.light_vectors.to(grey)
     normal = torch.einsum("pl,li,lj->pij", weight, L, L) + 1e-4 * torch.eye(3)
     scaled = torch.linalg.solve(normal, torch.einsum("pl,li,pl->pi", weight, L, grey)[..., None])[..., 0]
-    result = torch.zeros(*stack.mask.shape, 3)
-    result[..., 2] = 1.0
-    result[stack.mask] = torch.nn.functional.normalize(scaled, dim=-1)
-    return result
+    return torch.nn.functional.normalize(scaled, dim=-1)
 
 
 def surface_stretch(

@@ -133,7 +133,8 @@ def _weights(value: Tensor, measured: Tensor, plateau: Tensor, noise: float) -> 
     """
     high = value.abs()
     size = (high * measured).amax(0).clamp_(min=1e-6) + noise / MODEL_ERROR
-    lit = plateau / (high * plateau).amax(0).clamp_(min=1e-6) ** 2
+    # Never of a value below the noise, as where a channel is dark: its weight would drown all others' digits.
+    lit = plateau / (high * plateau).amax(0).clamp_(min=max(1e-6, noise)) ** 2
     tail = measured / high.add_(0.02 * size).square_().add_((noise / MODEL_ERROR) ** 2)
     return tail.add_(lit), lit, size
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import cast
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from reflectsep.data import FrameStream, PhotometricStack, Scattering, SweepReport
@@ -20,8 +20,9 @@ from reflectsep.errors import SweepError
 from reflectsep.flags import Flag, mark
 from reflectsep.io.ahead import one_thread
 from reflectsep.progress import Progress, silent
+from reflectsep.room import copied, empty
 from reflectsep.scatter.band import LitBand
-from reflectsep.scatter.evidence import Evidence
+from reflectsep.scatter.evidence import Evidence, Picture
 from reflectsep.scatter.exponent import complete
 from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
@@ -101,10 +102,8 @@ def _measured(
     prepared = _prepare(stack, sweeps, lights, passages, gains, options, progress)
     warnings = list(gains.warnings) + _warn(prepared, options)
     normals = crude_normals(stack)
-    sums = torch.stack(
-        [_root_sum(p, prepared, gains.n_d, options, _stretch(stack, normals, p)) / p.gain for p in prepared]
-    )
-    noise = torch.stack([_root_sd(p, gains.n_d) for p in prepared])
+    sums = [_root_sum(p, prepared, gains.n_d, options, _stretch(stack, normals, p)).div_(p.gain) for p in prepared]
+    noise = [_root_sd(p, gains.n_d) for p in prepared]
     root, root_sd, measured = _combine(stack, lights, sums, noise)
     return Scattering(
         root=root,
@@ -287,7 +286,7 @@ def _root_sum(
         partner_gain=1.0 if other is None else p.gain / other.gain,
         stretch=stretch,
     )
-    return FILLINGS[options.hole_filling](p.evidence, setting) * p.evidence.mask
+    return copied(FILLINGS[options.hole_filling](p.evidence, setting).mul_(p.evidence.mask))
 
 
 def _root_noise(p: _Prepared, n_d: float) -> float:
@@ -303,22 +302,22 @@ def _root_sd(p: _Prepared, n_d: float) -> Tensor:
 
 
 def _combine(
-    stack: PhotometricStack, lights: list[int], sums: Float[Tensor, "sweeps channels height width"], noise: Tensor
+    stack: PhotometricStack, lights: list[int], sums: list[Picture], noise: list[Picture]
 ) -> tuple[Tensor, Tensor, tuple[bool, ...]]:
     """Average the sweeps of each light; mix the lights without one from the basis."""
-    index = torch.tensor(lights)
     measured = tuple(k in lights for k in range(len(stack.names)))
-    root, variance = torch.zeros_like(stack.images), torch.zeros_like(stack.images)
+    root, variance = (empty(*stack.images.shape, dtype=stack.images.dtype) for _ in range(2))
     for k in set(lights):
-        own = index == k
-        root[k] = sums[own].mean(0)
-        variance[k] = (noise[own] ** 2).sum(0) / int(own.sum()) ** 2
+        own = [i for i, light in enumerate(lights) if light == k]
+        for c in range(root.shape[1]):
+            root[k, c] = torch.stack([sums[i][c] for i in own]).mean(0)
+            variance[k, c] = (torch.stack([noise[i][c] for i in own]) ** 2).sum(0) / len(own) ** 2
     alpha = stack.alpha.to(root)
     for j, has in enumerate(measured):
-        if not has:
-            root[j] = torch.einsum("k,kchw->chw", alpha[j], root[:3])
-            variance[j] = torch.einsum("k,kchw->chw", alpha[j] ** 2, variance[:3])
-    return root, variance.sqrt(), measured
+        for c in range(0 if has else root.shape[1]):
+            root[j, c] = torch.einsum("k,khw->hw", alpha[j], root[:3, c])
+            variance[j, c] = torch.einsum("k,khw->hw", alpha[j] ** 2, variance[:3, c])
+    return root, variance.sqrt_(), measured
 
 
 def _flags(stack: PhotometricStack, prepared: list[_Prepared]) -> Tensor:

@@ -24,6 +24,7 @@ from reflectsep.data import FrameStream, Sweep
 from reflectsep.errors import SweepError
 from reflectsep.io.ahead import one_thread
 from reflectsep.progress import Progress
+from reflectsep.room import copied, empty
 from reflectsep.scatter.frames import Step, name_of, steps
 from reflectsep.scatter.local import quantile
 from reflectsep.scatter.width import Keeper, Kept
@@ -167,7 +168,7 @@ class _Sums:
         self.mask = mask
         self.powers, self.where = 1.0 / exponents.to(full), samples.flatten().nonzero()[:, 0]
         self.q4, self.q8, self.q4t, self.peak = (torch.zeros_like(scale) for _ in range(4))
-        self.total = torch.zeros_like(full)
+        self.total = empty(*full.shape, dtype=full.dtype).zero_()
         maps = (1.0 / (len(full) * scale), self.q4, self.q8, self.q4t, self.peak)
         self.tiles = [_Tile(place, maps, self.total) for place in tiles(mask, CACHED)]
         self.scratch = torch.empty(max((tile.scale.numel() for tile in self.tiles), default=0), dtype=full.dtype)
@@ -217,20 +218,21 @@ class _Sums:
         lost_away = torch.full_like(centre, torch.inf)
         for index in self.lost:
             lost_away = torch.minimum(lost_away, (centre - index).abs() - width / 2)
+        self.total *= mask
         return Passage(
             sweep=sweep,
-            centre=centre,
-            peak=peak,
-            lit_frames=lit,
+            centre=copied(centre),
+            peak=copied(peak),
+            lit_frames=copied(lit),
             narrow=(lit < BROAD * width) & ((centroid - centre).abs() <= JUMP_FRAMES),
-            total=self.total * mask,
+            total=self.total,
             clipped=self.clipped,
             first=self.indices[0],
             last=self.indices[-1],
             received=received,
             noise=float(torch.tensor(self.noises).quantile(0.25)) if self.noises else 0.0,
             sums=self.sums,
-            lost_away=lost_away,
+            lost_away=copied(lost_away),
             kept=kept,
         )
 

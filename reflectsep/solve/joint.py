@@ -69,8 +69,8 @@ def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: 
     """S and the reduced gradient at (local, shared), chunk by chunk."""
 
     def reduced(cut: slice) -> tuple[Tensor, Tensor]:
-        part = problem.take(cut)
-        r, J, K = part.linearise(local[cut], shared)
+        part, here, there = problem.chunk(cut, local[cut], shared)
+        r, J, K = part.linearise(here, there)
         weight = robust_weight(r, part.threshold)
         V, gl = normal_equations(r, J, weight)
         weighted = K * weight[..., None]
@@ -78,7 +78,7 @@ def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: 
         V_inv = inverse(V)
         S = torch.einsum("nmg,nmh->gh", weighted, K) - torch.einsum("npg,npq,nqh->gh", W, V_inv, W)
         gradient = torch.einsum("nmg,nm->g", weighted, r) - torch.einsum("npg,npq,nq->g", W, V_inv, gl)
-        return S[None], gradient[None]
+        return S[None].to(local.device), gradient[None].to(local.device)
 
     S, gradient = (parts.sum(0) for parts in by_chunks(len(local), chunk, reduced))
     if problem.shared_residual is not None:
@@ -130,21 +130,26 @@ def follow(problem: BlockProblem, local: Tensor, shared: Tensor, step: Tensor, c
     """
 
     def moved(cut: slice) -> tuple[Tensor]:
-        part, here = problem.take(cut), local[cut]
-        r, J, K = part.linearise(here, shared)
+        part, here, before, by = problem.chunk(cut, local[cut], shared, step)
+        r, J, K = part.linearise(here, before)
         weight = robust_weight(r, part.threshold)
         V, gl = normal_equations(r, J, weight)
-        pull = gl + (J.mT @ (weight * (K @ step))[..., None])[..., 0]
+        pull = gl + (J.mT @ (weight * (K @ by))[..., None])[..., 0]
         there = here - (inverse(V) @ pull[..., None])[..., 0]
-        better = part.costs(there, shared + step) < part.costs(here, shared + step)
-        return (torch.where(better[:, None], there, here),)
+        better = part.costs(there, before + by) < part.costs(here, before + by)
+        return (torch.where(better[:, None], there, here).to(local.device),)
 
     return by_chunks(len(local), chunk, moved)[0]
 
 
 def costs_in_chunks(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: int) -> Float[Tensor, "blocks"]:
     """Cost of every block, chunk by chunk."""
-    return by_chunks(len(local), chunk, lambda cut: (problem.take(cut).costs(local[cut], shared),))[0]
+
+    def costs(cut: slice) -> tuple[Tensor]:
+        part, here, there = problem.chunk(cut, local[cut], shared)
+        return (part.costs(here, there).to(local.device),)
+
+    return by_chunks(len(local), chunk, costs)[0]
 
 
 def local_in_chunks(
@@ -158,8 +163,10 @@ def local_in_chunks(
     """`solve_local`, chunk by chunk; of the blocks `which` alone, whose places `local` are, where it is given."""
 
     def solved(cut: slice) -> tuple[Tensor, ...]:
-        part = solve_local(problem.take(cut if which is None else which[cut]), local[cut], shared, termination)
-        return part.local, part.cost, part.converged, torch.tensor([part.iterations])
+        blocks, here, there = problem.chunk(cut if which is None else which[cut], local[cut], shared)
+        part = solve_local(blocks, here, there, termination)
+        found = (each.to(local.device) for each in (part.local, part.cost, part.converged))
+        return *found, torch.tensor([part.iterations])
 
     places, cost, converged, iterations = by_chunks(len(local), chunk, solved)
     return LocalSolution(local=places, cost=cost, converged=converged, iterations=int(iterations.max()))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -38,6 +39,8 @@ class BlockProblem:
     jacobian: Jacobians | None = None
     """Closed form: (local, shared, *data, with_shared=bool) -> r (blocks, M), dr/dl (blocks, M, P), and dr/dg
     (blocks, M, G) if asked for, else None."""
+    device: torch.device | None = None
+    """Where blocks that are taken from it are worked on; None: where they are."""
 
     def __len__(self) -> int:
         """Number of blocks."""
@@ -45,7 +48,17 @@ class BlockProblem:
 
     def take(self, index: Int[Tensor, "some"] | slice) -> BlockProblem:
         """The same problem on some of the blocks."""
-        return replace(self, data=tuple(d[index] for d in self.data))
+        data = tuple(d[index] for d in self.data)
+        if self.device is None:
+            return replace(self, data=data)
+        threshold = None if self.threshold is None else self.threshold.to(self.device)
+        return replace(self, data=tuple(d.to(self.device) for d in data), threshold=threshold)
+
+    def chunk(self, index: Int[Tensor, "some"] | slice, local: Tensor, *shared: Tensor) -> tuple[Any, ...]:
+        """Some of the blocks, with their own and with shared parameters beside them where they are worked on."""
+        part = self.take(index)
+        there = part.data[0].device
+        return part, local.to(there), *(each.to(there) for each in shared)
 
     def residuals(self, local: Tensor, shared: Tensor) -> Tensor:
         """r, (blocks, M)."""

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from reflectsep.errors import ReflectsepError, SaidElsewhereError, WorkerError
+from reflectsep.room import rows as rows_of
 
 SHARES = 4
 """Several chunks come in multiples of so many: three for two processes would keep one of them waiting."""
@@ -105,13 +106,28 @@ def by_chunks(count: int, chunk: int, work: Callable[[slice], tuple[Tensor, ...]
         crew = _ALONE  # not one for each: then everybody does all of it, which is as quick
     token = _workers.set(_ALONE)
     try:
+        if crew.count == 1:
+            return _joined(count, cuts, work)
         own = [work(cut) for cut in cuts[crew.rank :: crew.count]]
     finally:
         _workers.reset(token)
-    columns = list(zip(*own, strict=True))
-    if crew.count == 1:
-        return tuple(torch.cat(parts) for parts in columns)
-    return tuple(_gather(list(parts), crew, len(cuts)) for parts in columns)
+    return tuple(_gather(list(parts), crew, len(cuts)) for parts in zip(*own, strict=True))
+
+
+def _joined(count: int, cuts: list[slice], work: Callable[[slice], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+    """What `work` gives for every chunk; values of single blocks go to their places at once."""
+    columns: list[Tensor | list[Tensor]] = []
+    for i, cut in enumerate(cuts):
+        parts = work(cut)
+        if i == 0:
+            of_blocks = [len(part) == cut.stop - cut.start and len(part) != 1 for part in parts]
+            columns = [rows_of(count, part) if each else [] for part, each in zip(parts, of_blocks, strict=True)]
+        for column, part in zip(columns, parts, strict=True):
+            if isinstance(column, list):
+                column.append(part)
+            else:
+                column[cut] = part
+    return tuple(torch.cat(column) if isinstance(column, list) else column for column in columns)
 
 
 def cuts_of(count: int, chunk: int) -> list[slice]:

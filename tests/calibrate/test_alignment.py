@@ -5,7 +5,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
+from reflectsep.calibrate import across_lights
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.alignment import align, aligned_stream, covered
 from reflectsep.calibrate.exposure import developed_stream, response_of
@@ -66,6 +68,26 @@ def test_lights_are_found_against_the_first(drifted, found):
         error = displacement(truth(drifted, f"full/{name}").matrix @ torch.linalg.inv(motion.matrix), mask)
         assert error < 0.2
         assert error < 4 * motion.sd_px
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_large_pictures_under_other_lights_are_compared_by_their_means(drifted, found, monkeypatch, factor):
+    raw, mask = read_full(drifted), read_mask(drifted)
+    pictures, _ = develop_pictures(drifted, raw, response_of(drifted))
+    grey = pictures.mean(1).double()
+    monkeypatch.setattr(across_lights, "LARGEST_PICTURE", mask.numel() // factor**2)
+    motion = across_lights.across(grey[0], grey[1], mask)
+    if factor == 1:
+        assert torch.equal(motion.matrix, found.pictures[drifted.names[1]].matrix)
+    true = truth(drifted, f"full/{drifted.names[1]}").matrix
+    assert displacement(true, mask) > 1.0
+    error = displacement(true @ torch.linalg.inv(motion.matrix), mask)
+    assert error < 0.2 * factor
+    assert error < 4 * motion.sd_px
+    assert motion.displacement_px == pytest.approx(displacement(motion.matrix, mask), rel=0.02)
+    if factor == 2:
+        small = across_lights.across(*avg_pool2d(grey[:2], 2), avg_pool2d(mask[None].float(), 2)[0] > 0.5)
+        assert motion.sd_px == 2.0 * small.sd_px
 
 
 def test_a_sweep_is_moved_once_by_both_its_motions(drifted, found):

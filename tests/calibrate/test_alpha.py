@@ -5,6 +5,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from reflectsep.calibrate import linear_combination
 from reflectsep.calibrate.alpha import alpha_from_vectors, check_basis, condition_number, light_vector, solve_alpha
 from reflectsep.calibrate.linear_combination import EstimateSettings, estimate_alpha, select_diffuse, signed_root
 from reflectsep.data import Light
@@ -221,6 +222,18 @@ def test_a_share_of_the_pixels_is_enough():
     share = estimate_alpha(images[:3], images[4], mask[None], settings=EstimateSettings(most_pixels=500))
     torch.testing.assert_close(share.alpha, whole.alpha, rtol=0, atol=0.01)
     assert float(share.sd.norm()) < 10 * float(whole.sd.norm())
+
+
+def test_of_a_very_large_picture_every_so_many_rows_and_columns_are_enough(monkeypatch):
+    images, mask = render(LIGHTS, noise=0.003)
+    monkeypatch.setattr(linear_combination, "LARGEST_PICTURE", 72 * 72)
+    whole = estimate_alpha(images[:3], images[4], mask[None])
+    expected = estimate_alpha(images[:3, :, ::2, ::2], images[4, :, ::2, ::2], mask[None, ::2, ::2])
+    monkeypatch.setattr(linear_combination, "LARGEST_PICTURE", 72 * 72 // 4)
+    share = estimate_alpha(images[:3], images[4], mask[None])
+    assert torch.equal(share.alpha, expected.alpha)
+    assert share.pixels < whole.pixels / 3
+    torch.testing.assert_close(share.alpha, whole.alpha, rtol=0, atol=0.01)
 
 
 def test_unusable_values_do_not_count():

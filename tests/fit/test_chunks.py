@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reflectsep.fit import chunks
-from reflectsep.fit.chunks import cuts, in_chunks
+from reflectsep.fit.chunks import cuts, in_chunks, taken
 
 
 @given(st.integers(1, 200_000))
@@ -24,3 +24,10 @@ def test_results_stand_in_the_pixels_order_and_keep_their_kind(monkeypatch):
 
 def test_of_no_pixels_there_is_nothing():
     assert in_chunks(0, lambda cut: torch.ones(5, 2)[:0][cut]).shape == (0, 2)
+    assert list(cuts(0)) == []
+
+
+def test_rows_taken_are_those_of_the_index(monkeypatch):
+    monkeypatch.setattr(chunks, "AT_ONCE", 3)
+    values, index = torch.arange(20.0).view(10, 2), torch.tensor([9, 0, 4, 4, 7])
+    assert torch.equal(taken(values, index), values[index])

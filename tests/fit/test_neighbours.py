@@ -71,8 +71,26 @@ def test_medians_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, ro
     mask = some_mask()
     values = some_values(mask)
     whole = local_median(values, mask, 2)
-    monkeypatch.setattr(neighbours, "PIXELS_OF_A_BAND", rows * mask.shape[1])
+    monkeypatch.setattr(neighbours, "PIXELS_OF_WINDOWS", rows * mask.shape[1])
     assert torch.equal(local_median(values, mask, 2), whole)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_means_and_surfaces_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, rows):
+    mask = some_mask()
+    mask[3:6] = False  # bands without a pixel, too
+    values, weight = some_values(mask, 3), some_values(mask)[:, 0] + 0.1
+    mean, surface = smooth(values, weight, mask, 1.0), local_quadratic(values, weight, mask, 1.0)
+    monkeypatch.setattr(neighbours, "PIXELS_OF_A_BAND", rows * mask.shape[1])
+    assert torch.equal(smooth(values, weight, mask, 1.0), mean)
+    parts = local_quadratic(values, weight, mask, 1.0)
+    assert torch.equal(parts[0], surface[0])
+    assert torch.equal(parts[1], surface[1])
+
+
+def test_of_an_empty_mask_there_is_nothing():
+    nothing = torch.zeros(5, 4, dtype=torch.bool)
+    assert smooth(torch.ones(0, 2), torch.ones(0), nothing, 1.0).shape == (0, 2)
 
 
 def test_quadratics_a_few_pixels_at_a_time_are_those_of_all(monkeypatch):

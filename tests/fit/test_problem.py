@@ -5,13 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
+from reflectsep.fit import chunks
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.expectations import (
     first_priors,
     noise_level,
     parallel_spread,
     parallel_weight,
+    quantile,
     shape_spread,
     with_facing,
     with_ratio,
@@ -286,6 +290,32 @@ def test_handing_lobes_on_never_raises_a_cost_and_mends_wrong_pixels(small_case)
     torch.testing.assert_close(mended.cost, problem.costs(mended.local, shared))
     right = ((mended.local - local).abs() < 0.01 * local.abs().amax(1, keepdim=True)).all(1)
     assert float(right[::7].double().mean()) > 0.9
+
+
+def test_merging_a_few_pixels_at_a_time_is_merging_all(monkeypatch):
+    g = torch.Generator().manual_seed(3)
+    rand = lambda *n: torch.rand(*n, generator=g, dtype=torch.float64)  # noqa: E731
+    first = merge(None, torch.arange(50), rand(50, 3), rand(50), rand(50) > 0.5, 50)
+    which = torch.randperm(50, generator=g)[:37]
+    more = which, rand(37, 3), rand(37), rand(37) > 0.5, 50
+    before = first.local.clone()
+    whole = merge(first, *more)
+    assert torch.equal(first.local, before)
+    monkeypatch.setattr(chunks, "AT_ONCE", 5)
+    parts = merge(first, *more)
+    for name in ("local", "cost", "runner_up", "converged"):
+        assert torch.equal(getattr(parts, name), getattr(whole, name)), name
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.floats(0, 1))
+def test_a_quantile_is_torchs_own_bit_for_bit(values, share):
+    values = torch.tensor(values, dtype=torch.float64)
+    assert quantile(values, share) == float(values.quantile(share))
+
+
+def test_a_quantile_among_the_finite_ones_takes_no_notice_of_the_infinite():
+    assert quantile(double([torch.inf, 1.0, 3.0, 2.0, torch.inf]), 0.5) == 3.0
+    assert quantile(double([torch.inf, 1.0]), 1.0) == torch.inf
 
 
 def test_merging_keeps_the_better_and_remembers_the_other():

@@ -1,10 +1,13 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from reflectsep.data import PhotometricStack
+from reflectsep.scatter import geometry
 from reflectsep.scatter.exponent import GRID, Samples, solve_exponent
 from reflectsep.scatter.filling import fill_along_time, fill_by_interpolation, fill_by_maximum
 from reflectsep.scatter.frames import signed_root, steps
@@ -19,6 +22,29 @@ def test_root_keeps_the_sign_and_is_undone(value, n_d):
     root = signed_root(x, n_d)
     assert root.sign() == x.sign()
     assert float(signed_root(root, 1 / n_d)) == pytest.approx(value, abs=1e-9)
+
+
+@pytest.mark.parametrize("at_once", [1, 7])
+def test_normals_some_pixels_at_a_time_are_those_of_all(monkeypatch, at_once):
+    g = torch.Generator().manual_seed(2)
+    vectors = torch.nn.functional.normalize(torch.randn(6, 3, generator=g) + torch.tensor([0.0, 0.0, 3.0]), dim=1)
+    mask = torch.rand(9, 9, generator=g) > 0.3
+    stack = PhotometricStack(
+        names=tuple("abcdef"),
+        images=torch.rand(6, 3, 9, 9, generator=g),
+        saturated=torch.zeros(6, 3, 9, 9, dtype=torch.bool),
+        mask=mask,
+        alpha=torch.zeros(6, 3),
+        light_vectors=vectors,
+        view=torch.tensor([0.0, 0.0, 1.0]),
+        flags=torch.zeros(9, 9, dtype=torch.int32),
+    )
+    whole = geometry.crude_normals(stack)
+    monkeypatch.setattr(geometry, "PIXELS_AT_ONCE", at_once)
+    parts = geometry.crude_normals(stack)
+    torch.testing.assert_close(parts, whole, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(whole.norm(dim=-1), torch.ones(9, 9))
+    assert (whole[~mask] == torch.tensor([0.0, 0.0, 1.0])).all()
 
 
 def test_beyond_is_the_integral_of_the_radial_spread():
@@ -69,6 +95,20 @@ def profiles(root, u, half):
         at=torch.arange(u.shape[1]),
         **flat,
     )
+
+
+def test_a_dark_channel_fills_with_next_to_nothing():
+    # A value of exactly 0 in the one frame that is surely lit; everything else is noise.
+    noise = 3e-4
+    u = torch.arange(-11.0, 12.0)[:, None] + torch.linspace(-0.45, 0.45, 50)
+    g = torch.Generator().manual_seed(4)
+    root = noise * torch.randn(u.shape, generator=g).clamp_min(0.0)
+    root[10:13] = 0.0
+    p = profiles(root, u, 1.3)
+    light = torch.cat([torch.full((11,), 1.0), 0.5 ** torch.arange(12.0).square()])[:, None].expand_as(u)
+    slab = Slab(half=1.0, edge=0.6, frames_per_px=0.5)
+    filled = fill_by_profile(replace(p, light=light), slab, distance_px=1.0, noise=noise)
+    assert float(filled.abs().max()) < 10 * noise
 
 
 def test_profile_recovers_its_own_model():

@@ -84,6 +84,15 @@ def test_alone_chunks_are_joined_in_order():
     torch.testing.assert_close(sums, torch.stack([part.sum() for part in everything.split(3)]))
 
 
+def test_parts_that_are_no_block_each_are_joined_whatever_their_length():
+    def some(cut):
+        return torch.ones(3, 2) * cut.start, torch.arange(float(cut.start), float(cut.stop))
+
+    threes, blocks = by_chunks(12, 4, some)  # a chunk is four: one of four and one of eight
+    assert torch.equal(threes[:, 0], torch.tensor([cut.start for cut in cuts_of(12, 4) for _ in range(3)]).float())
+    assert torch.equal(blocks, torch.arange(12.0))
+
+
 @given(st.integers(1, 200_000), st.integers(1, 5000))
 def test_cuts_cover_the_blocks_and_leave_no_process_waiting(count, chunk):
     cuts = cuts_of(count, chunk)
