@@ -133,7 +133,8 @@ def _weights(value: Tensor, measured: Tensor, plateau: Tensor, noise: float) -> 
     """
     high = value.abs()
     size = (high * measured).amax(0).clamp_(min=1e-6) + noise / MODEL_ERROR
-    lit = plateau / (high * plateau).amax(0).clamp_(min=1e-6) ** 2
+    # Lit frames may be dark to the last digit, in a shadow: they count no more than a dark frame beside them.
+    lit = plateau / torch.maximum((high * plateau).amax(0), 0.02 * size) ** 2
     tail = measured / high.add_(0.02 * size).square_().add_((noise / MODEL_ERROR) ** 2)
     return tail.add_(lit), lit, size
 
