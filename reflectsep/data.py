@@ -231,6 +231,11 @@ class Scattering:
     flags: Int[Tensor, "height width"]
     warnings: tuple[str, ...] = ()
 
+    @property
+    def invalid(self) -> Bool[Tensor, "height width"]:
+        """Pixels whose root is not finite under at least one light; they are not fitted."""
+        return ~self.root.isfinite().all(1).all(0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:

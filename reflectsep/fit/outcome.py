@@ -158,6 +158,8 @@ def final_flags(
     """Flags of the stack and of the scattering, and what the fit itself noticed."""
     obs, found = state.obs, state.found
     flags = stack.flags if scattering is None else stack.flags | scattering.flags
+    if scattering is not None:
+        flags = mark(flags, scattering.invalid & stack.mask & ~state.mask, Flag.INVALID_INPUT)
     x = unpack(found.local, obs.channels)
     shine = in_chunks(len(obs), lambda cut: shine_of(state, cut).amax(-1))
 

@@ -113,6 +113,10 @@ def observe(
     mask = stack.mask & ((stack.flags & int(Flag.INVALID_INPUT)) == 0)
     if not bool(mask.any()):
         raise FitError("no pixel to fit: the mask is empty or every pixel has invalid values")
+    if scattering is not None and options.scattering != "none":
+        pixels, mask = int(mask.sum()), mask & ~scattering.invalid
+        if not bool(mask.any()):
+            raise FitError(f"no pixel to fit: the scattering is not finite at any of the {pixels} pixels")
     known = stack.light_vectors is not None
     vectors = stack.light_vectors.to(dtype) if stack.light_vectors is not None else torch.eye(3, dtype=dtype)
     intensity = vectors.norm(dim=-1) if known else torch.ones(lights, dtype=dtype)
@@ -294,6 +298,9 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
 def with_noise_of_fit(state: State, options: FitOptions) -> State:
     """The noise as the fit itself leaves it: the first figure, from before any lobe was known, is too large."""
     rms = in_chunks(len(state.obs), lambda cut: picture_residual(state, cut).square().mean((1, 2)).sqrt())
+    unsound = int((~rms.isfinite() | ~state.found.cost.isfinite()).sum())
+    if unsound > 0.5 * len(rms):
+        raise FitError(f"{unsound} of {len(rms)} pixels have no finite cost at any start: no noise level can be told")
     unknowns = unknowns_in_effect(state.obs, state.priors, state.found.local, state.shared)
     return with_noise(state, options, noise_of(state.obs.images, rms, unknowns))
 

@@ -133,8 +133,10 @@ def _weights(value: Tensor, measured: Tensor, plateau: Tensor, noise: float) -> 
     """
     high = value.abs()
     size = (high * measured).amax(0).clamp_(min=1e-6) + noise / MODEL_ERROR
-    # Never of a value below the noise, as where a channel is dark: its weight would drown all others' digits.
-    lit = plateau / (high * plateau).amax(0).clamp_(min=max(1e-6, noise)) ** 2
+    # Lit frames may be dark to the last digit, in a shadow or a channel: they count no more than a dark frame beside
+    # them, nor than the noise allows. Their weight would drown all others' digits.
+    least = (0.02 * size).clamp_min(max(1e-6, noise))
+    lit = plateau / torch.maximum((high * plateau).amax(0), least) ** 2
     tail = measured / high.add_(0.02 * size).square_().add_((noise / MODEL_ERROR) ** 2)
     return tail.add_(lit), lit, size
 

@@ -9,7 +9,8 @@ from reflectsep.errors import FitError
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import LOG_N_D, Locals, s_of_lights
-from reflectsep.fit.reflectance import fit_reflectance, observe, prepare
+from reflectsep.fit.reflectance import fit_reflectance, observe, prepare, with_noise_of_fit
+from reflectsep.fit.solution import fit_locals
 from reflectsep.flags import Flag
 
 QUICK = FitOptions(
@@ -58,7 +59,30 @@ def test_invalid_pixels_are_left_out(small_case):
     obs, mask, _ = observe(stack, small_case.scattering, FitOptions(), torch.float64)
     assert not mask[2, 3]
     assert len(obs) == int(small_case.stack.mask.sum()) - 1
-    assert obs.images.isfinite().all()
+
+
+def test_pixels_whose_scattering_is_no_number_are_left_out_and_flagged(small_case):
+    root = small_case.scattering.root.clone()
+    root[1, 0, 2, 3] = torch.nan
+    broken = replace(small_case.scattering, root=root)
+    fit = fit_reflectance(small_case.stack, broken, QUICK)
+    assert fit.d.isfinite().all()
+    assert torch.isfinite(torch.tensor(fit.noise))
+    assert int(fit.flags[2, 3]) & int(Flag.INVALID_INPUT)
+    assert int(((fit.flags & int(Flag.INVALID_INPUT)) > 0).sum()) == 1
+    without = fit_reflectance(small_case.stack, broken, replace(QUICK, scattering="none"))
+    assert not (without.flags & int(Flag.INVALID_INPUT)).any()
+    with pytest.raises(FitError, match=r"scattering is not finite at any of the \d+ pixels"):
+        fit_reflectance(small_case.stack, replace(broken, root=torch.full_like(root, torch.nan)), QUICK)
+
+
+def test_costs_that_are_no_numbers_are_said(small_case):
+    obs, mask, _ = observe(small_case.stack, small_case.scattering, QUICK, torch.float64)
+    state = prepare(obs, mask, QUICK)
+    found = fit_locals(state.obs, state.priors, state.shared, state.effort, state.robust)
+    state = replace(state, found=replace(found, cost=torch.full_like(found.cost, torch.inf)))
+    with pytest.raises(FitError, match=rf"{len(obs)} of {len(obs)} pixels have no finite cost"):
+        with_noise_of_fit(state, QUICK)
 
 
 def test_brighter_lights_are_divided_out(small_case):

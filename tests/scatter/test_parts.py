@@ -11,7 +11,7 @@ from reflectsep.scatter import geometry
 from reflectsep.scatter.exponent import GRID, Samples, solve_exponent
 from reflectsep.scatter.filling import fill_along_time, fill_by_interpolation, fill_by_maximum
 from reflectsep.scatter.frames import signed_root, steps
-from reflectsep.scatter.kernel import Slab, beyond, fill_by_profile, line_response
+from reflectsep.scatter.kernel import Slab, _weights, beyond, fill_by_profile, line_response
 from reflectsep.scatter.windows import Profiles
 from reflectsep.solve.nonnegative import nonnegative_least_squares
 
@@ -124,6 +124,18 @@ def test_profile_recovers_its_own_model():
     expected = 2 * slab.half * (amplitude * far).sum()
     total = p.root.sum(0) - p.unsound + fill_by_profile(p, slab, distance_px=1.0, noise=0.0)
     assert torch.allclose(total, expected.expand_as(total), rtol=0.06)
+
+
+def test_lit_frames_that_are_dark_to_the_last_digit_weigh_no_more_than_others():
+    """A 12-bit camera with its black clipped, in a shadow: weights of 1e12 left no number in single precision."""
+    value = torch.zeros(9, 2)
+    value[1, 0], value[:, 1] = 0.0012, torch.linspace(0.1, 0.9, 9)
+    measured, plateau = torch.ones_like(value, dtype=torch.bool), torch.zeros_like(value, dtype=torch.bool)
+    measured[4], plateau[4] = False, True
+    weight, lit, size = _weights(value, measured, plateau, 3e-4)
+    assert torch.equal(lit[4], weight[4])
+    assert bool((weight <= 1.0001 / (0.02 * size) ** 2).all())
+    assert float(lit[4, 1]) == pytest.approx(1 / 0.5**2)
 
 
 def test_time_fills_a_line_exactly():
