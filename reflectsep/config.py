@@ -147,8 +147,9 @@ class FitSettings:
         0.03, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
     )
     robust: Literal["huber", "none"] = setting("huber", "loss that weighs cast shadows down")
-    lobe: Literal["auto", "haze", "single"] = setting(
-        "auto", "soft shadow edges where they pay; a haze besides; or the paper's formula alone"
+    lobe: Literal["auto", "ggx", "cosine", "single"] = setting(
+        "auto",
+        "GGX's or a power by the pictures, soft shadow edges where they pay; or the paper's formula alone",
     )
     max_iterations: int = setting(20, "limit of every joint solve", at_least=1)
     tolerance: float = setting(

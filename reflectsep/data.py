@@ -246,8 +246,8 @@ class Fit:
     n_d: Float[Tensor, ""]
     softness: Float[Tensor, ""]
     """Width of the shadow's edge over the mean scattering root; 0: hard, the paper's formula."""
-    haze: Float[Tensor, ""]
-    """Height of the lobe's haze; 0: the paper's single power."""
+    crest: Float[Tensor, ""]
+    """The lobe's argument in the mirror direction, where the lobe is that of GGX; 0: the paper's power."""
     global_names: tuple[str, ...]
     """Order of `covariance`: the globals that were free."""
     covariance: Float[Tensor, "globals globals"]

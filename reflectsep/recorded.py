@@ -62,7 +62,7 @@ def recorded_alignment(separation: Separation) -> Alignment | None:
 
 
 def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettings, progress: Progress) -> Separation:
-    """Lin & Lee's model fitted to the same pictures as a result, moved as these were."""
+    """Lin & Lee's model, whose lobe is a power of a cosine, fitted to a result's pictures, moved as these were."""
     return fit(
         capture,
         settings=settings,
@@ -71,6 +71,7 @@ def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettin
         alignment=recorded_alignment(separation),
         progress=progress,
         scattering="none",
+        lobe="cosine",
     )
 
 

@@ -56,7 +56,7 @@ class Separation:
     n_s: Float[Tensor, ""]
     n_d: Float[Tensor, ""]
     softness: Float[Tensor, ""]
-    haze: Float[Tensor, ""]
+    crest: Float[Tensor, ""]
     d: Float[Tensor, "3 channels height width"]
     s: Float[Tensor, "3 channels height width"]
     B: Float[Tensor, "channels height width"]
@@ -90,7 +90,7 @@ class Separation:
     def globals(self) -> Globals:
         """The shared parameters as the model takes them."""
         n_d = 1.0 if float(self.n_d) == 1.0 else self.n_d
-        return Globals(a=self.a, n_s=self.n_s, n_d=n_d, softness=self.softness, haze=self.haze)
+        return Globals(a=self.a, n_s=self.n_s, n_d=n_d, softness=self.softness, crest=self.crest)
 
     def relight(self, alpha: Float[Tensor, "*lights 3"]) -> Float[Tensor, "*lights channels height width"]:
         """Pictures under lights sum_k alpha_k L_k (Eqs. 15 and 21), linear, in the capture's units.
@@ -168,7 +168,7 @@ class Separation:
             lights[name] = {"alpha": self.alpha[i].tolist()}
             if vectors is not None:
                 lights[name]["vector"] = vectors[i].tolist()
-        shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "softness", "haze")}
+        shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "softness", "crest")}
         return {
             **self.document,
             "basis": list(self.basis),
@@ -211,7 +211,7 @@ def separate(
         n_s=fit.n_s,
         n_d=fit.n_d,
         softness=fit.softness,
-        haze=fit.haze,
+        crest=fit.crest,
         d=fit.d,
         s=fit.s[:3],
         B=fit.B,
@@ -254,7 +254,7 @@ def _components(separation: Separation, stack: PhotometricStack, measured: Tenso
     t = part.intensity[:, None, None, None]
     d, B = part.d.permute(2, 3, 1, 0), part.B.mean(0)
     u = lobe_argument(d, B, part.a, torch.eye(3)).permute(2, 0, 1)[:, None]
-    specular = (t * lobe(u, part.n_s, part.haze) * part.mask).expand_as(part.d)
+    specular = (t * lobe(u, part.n_s, part.crest) * part.mask).expand_as(part.d)
     diffuse = part.relight(torch.eye(3)) - specular
     pictures = stack.images[:3, :, rows]
     unknown = stack.saturated[:3, :, rows] | ~pictures.isfinite() | ~part.mask
@@ -267,9 +267,10 @@ def _components(separation: Separation, stack: PhotometricStack, measured: Tenso
     }
 
 
-def extensions(softness: float, haze: float) -> str:
+def extensions(softness: float, crest: float) -> str:
     """Which extensions of the paper's formula a result has, in a sentence; empty where it has none."""
-    named = [name for name, value in (("soft shadow edges", softness), ("a haze", haze)) if value > 0]
+    kept = (("soft shadow edges", softness), ("the lobe of GGX microfacets", crest))
+    named = [name for name, value in kept if value > 0]
     return f"{' and '.join(named)} lowered the cost and {'were' if softness > 0 else 'was'} kept" if named else ""
 
 

@@ -83,7 +83,7 @@ def describe(  # noqa: PLR0913  (every stage has its say)
     if alignment is not None:
         document["alignment"] = alignment.document(capture)
         warnings.extend(alignment.warnings)
-    kept = extensions(float(fitted.softness), float(fitted.haze))
+    kept = extensions(float(fitted.softness), float(fitted.crest))
     if kept:
         document["extensions"] = kept
     document["warnings"] = warnings
@@ -139,7 +139,7 @@ def summary(separation: Separation, *, full: bool = False) -> str:
         lines.append(f"  lights    {', '.join(separation.names)}; basis {', '.join(separation.basis)}")
         height, width = separation.mask.shape
         lines.append(f"  size      {width} x {height}, {int(separation.mask.sum())} pixels on the object")
-        kept = extensions(float(separation.softness), float(separation.haze))
+        kept = extensions(float(separation.softness), float(separation.crest))
         lines += [f"  beyond    {kept}"] if kept else []
         for name, entry in document.get("alpha_refined", {}).items():
             said = ", ".join(

@@ -93,7 +93,7 @@ def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
     wanted = ["pixels"]
     if options.method == "joint":
         wanted.append("joint fit")
-        if options.lobe != "single" and (swept or options.lobe == "haze"):
+        if options.lobe != "single" and swept:
             wanted.append("shadow edges")
         if swept:
             wanted.append("neighbourhood")

@@ -52,7 +52,7 @@ def _nominal_split(d: Tensor, alpha: Tensor, noise: float, bright: float) -> tup
         n_s=torch.tensor(NOMINAL_N_S, dtype=torch.float64),
         n_d=1.0,
         softness=torch.tensor(0.0, dtype=torch.float64),
-        haze=torch.tensor(0.0, dtype=torch.float64),
+        crest=torch.tensor(0.0, dtype=torch.float64),
     )
 
     def pictures(theta: Tensor) -> Tensor:

@@ -2,9 +2,10 @@
 
 From the roots r_k = d_k + s_k under basis lights of unit vectors L_k, g with L_k . g = r_k: a Lambertian surface of
 albedo |g| and normal g / |g|. The lobe's root is linear in the light, u(L) = h . L with L_k . h = a_k + B d_k: at most
-|h|, so the highlight's peak is |h|^n_s. Around it u falls as the cosine of the angle to h: a Phong lobe. Its exponent
-for the half-vector is about 4 n_s, to which a microfacet width of alpha = sqrt(2 / (4 n_s + 2)) belongs (Walter,
-Marschner, Li and Torrance, 2007); renderers that take a perceptual roughness use its square root (Burley, 2012).
+|h|, which gives the highlight's peak. Around it u falls as the cosine of the angle to h. A power of it is a Phong lobe;
+its exponent for the half-vector is about 4 n_s, to which a microfacet width of alpha = sqrt(2 / (4 n_s + 2)) belongs
+(Walter, Marschner, Li and Torrance, 2007). A GGX lobe has alpha = 1 / sqrt(1 + n_s) itself (`model`). Renderers that
+take a perceptual roughness use the square root of alpha (Burley, 2012).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.model import positive_power
+from reflectsep.model import lobe, positive_power
 from reflectsep.separation import Separation
 from reflectsep.srgb import encoded
 
@@ -35,6 +36,8 @@ class Textures:
     alpha: float
     """Width of the microfacet distribution."""
     n_s: float
+    crest: float
+    """Of the lobe; 0: a Phong lobe."""
     view: Float[Tensor, "3"]
 
     @property
@@ -59,45 +62,51 @@ def textures_of(separation: Separation, *, white: float) -> Textures:
     albedo = positive_power((g * normal[:, None]).sum(0), n_d) * intensity / white
     w = separation.a.double()[:, None, None] + separation.B.mean(0).double() * separation.d.mean(1).double()
     h = torch.einsum("ik,khw->ihw", solve, w).norm(dim=0)
-    n_s = float(separation.n_s)
+    n_s, crest = float(separation.n_s), separation.crest.double()
     whole = separation.diffuse.double().mean(0)
     share = separation.scattering.double().mean(0) / whole.clamp_min(1e-12)
     return Textures(
         base_colour=albedo * mask,
-        specular=(positive_power(h, n_s) * intensity / white * mask)[None],
+        specular=(lobe(h, separation.n_s.double(), crest) * intensity / white * mask)[None],
         normal=normal,
         scattering_colour=torch.where(mask & (whole > 1e-6 * white), share, 0.0).clamp(0.0, 1.0),
-        alpha=math.sqrt(2.0 / (4.0 * n_s + 2.0)),
+        alpha=1.0 / math.sqrt(1.0 + n_s) if crest > 0 else math.sqrt(2.0 / (4.0 * n_s + 2.0)),
         n_s=n_s,
+        crest=float(crest),
         view=separation.view.double(),
     )
 
 
 def rendered(textures: Textures, direction: Float[Tensor, "3"]) -> Float[Tensor, "channels height width"]:
-    """Screen picture that a renderer with a Lambertian base and a Phong highlight makes of the textures."""
+    """Screen picture that a renderer with a Lambertian base and a Phong or GGX highlight makes of the textures."""
     N, V, L = textures.normal, textures.view[:, None, None], direction.double()[:, None, None]
     lambert = (N * L).sum(0).clamp_min(0.0)
     mirrored = 2.0 * (N * V).sum(0) * N - V
-    shine = positive_power((mirrored * L).sum(0), textures.n_s) * (lambert > 0)
+    cosine, n_s = (mirrored * L).sum(0), torch.tensor(textures.n_s, dtype=torch.float64)
+    crest = torch.tensor(float(textures.crest > 0), dtype=torch.float64)  # of a lobe of height 1
+    shine = lobe(cosine, n_s, crest) * (lambert > 0)
     return encoded(textures.base_colour * lambert + textures.specular * shine)
 
 
 def note(textures: Textures, white: float, inside_db: float, all_db: float) -> str:
     """What the textures are, and what they cannot carry."""
+    formula, highlight = "sqrt(2 / (4 n_s + 2))", "a Phong highlight of exponent n_s"
+    if textures.crest > 0:
+        formula, highlight = "1 / sqrt(1 + n_s)", "a GGX highlight of that alpha"
     return f"""Textures of a separated object
 
 base_colour.exr/.png       albedo of the whole diffuse part (local and scattered): length of the Lambertian vector
                            fitted to the diffuse roots of the three basis lights
-specular.exr/.png          peak of the highlight, |h|^n_s, in the same unit; no Fresnel effect in it
+specular.exr/.png          peak of the highlight in the same unit; no Fresnel effect in it
 normal.png                 normal of that Lambertian vector, x right, y up, z to the camera, 16 bits: (n + 1) / 2
 scattering_colour.exr/.png share of the diffuse light that left the object elsewhere than it entered
 roughness                  {textures.roughness:.4f}, one for the object, from n_s = {textures.n_s:.3f}:
-                           alpha = sqrt(2 / (4 n_s + 2)) = {textures.alpha:.4f}, roughness = sqrt(alpha)
+                           alpha = {formula} = {textures.alpha:.4f}, roughness = sqrt(alpha)
 
 EXR files are linear, 1 is white = {white:.6g} in the capture's units under a light of the basis lights' mean
 intensity; PNG files are the same through the sRGB curve (specular and scattering share: linear), clipped at 1.
 
-Rendered with a Lambertian base and a Phong highlight of exponent n_s these textures are {inside_db:.1f} dB from the
+Rendered with a Lambertian base and {highlight} these textures are {inside_db:.1f} dB from the
 relit pictures for lights between the basis lights, {all_db:.1f} dB for all lights fitted (8-bit screen values, peak 1).
 
 What they cannot carry: cast shadows and inter-reflections are baked into the colour; the width of the scattering and

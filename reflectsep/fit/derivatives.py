@@ -20,10 +20,10 @@ from torch import Tensor
 from reflectsep.fit.mixing import by_beta
 from reflectsep.fit.problem import (
     ALPHA,
+    GGX,
     LOG_C_2,
     LOG_N_D,
     LOG_N_S,
-    ROOT_HAZE,
     SOFTNESS,
     Locals,
     Observations,
@@ -37,7 +37,7 @@ from reflectsep.fit.problem import (
     unpack,
     unpack_globals,
 )
-from reflectsep.model import HAZE_RATIO, Globals, diffuse, edge_width, lobe, lobe_argument
+from reflectsep.model import Globals, diffuse, edge_width, lobe, lobe_argument, lobe_slope
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class LobeSlopes:
 
     by_u: Float[Tensor, "pixels lights"]
     by_log_n_s: Float[Tensor, "pixels lights"]
-    by_root_haze: Float[Tensor, "pixels lights"]
+    by_log_crest: Float[Tensor, "pixels lights"]
 
 
 @dataclass(frozen=True)
@@ -59,18 +59,22 @@ class BodySlopes:
 
 
 def lobe_slopes(u: Float[Tensor, "pixels lights"], shared: Globals) -> LobeSlopes:
-    """Of u^n_s + h u^(n_s / 8), zero where u <= 0."""
-    lit = u > 0
-    safe = torch.where(lit, u, torch.ones_like(u))
-    log = safe.log()
-    narrow = torch.where(lit, (shared.n_s * log).exp(), 0.0)
-    by_u, by_n = narrow, narrow
-    by_haze = torch.zeros_like(u)
-    if float(shared.haze) > 0:
-        wide = torch.where(lit, (shared.n_s / HAZE_RATIO * log).exp(), 0.0)
-        by_u = by_n = narrow + shared.haze / HAZE_RATIO * wide
-        by_haze = 2.0 * shared.haze.sqrt() * wide
-    return LobeSlopes(shared.n_s * by_u / safe, shared.n_s * by_n * log, by_haze)
+    """Of u^n_s or GGX's lobe, zero where u <= 0."""
+    n, lit = shared.n_s, u > 0
+    zero = torch.zeros_like(u)
+    if not bool(shared.crest > 0):
+        safe = torch.where(lit, u, torch.ones_like(u))
+        log = safe.log()
+        power = torch.where(lit, (n * log).exp(), zero)
+        return LobeSlopes(n * power / safe, n * power * log, zero)
+    v = u / shared.crest
+    value, by_u = lobe(u, n, shared.crest), lobe_slope(u, n, shared.crest)
+    w, least = 1.0 + n * (1.0 - v.clamp(0.0, 1.0)) / 2.0, 1.0 + n / 2.0
+    # w rises with n by (1 - v) / 2 and `least` by 1 / 2, hence by log n by w - 1 and by least - 1.
+    core = torch.where(v > 1, n * v.clamp_min(1.0) ** n * v.clamp_min(1.0).log(), -2.0 * (w - 1.0) * w**-3)
+    by_log_n = n * shared.crest.log() * value + shared.crest**n * (core + 2.0 * (least - 1.0) * least**-3)
+    by_log_crest = n * value - by_u * u
+    return LobeSlopes(*(torch.where(lit, slope, zero) for slope in (by_u, by_log_n, by_log_crest)))
 
 
 def body_slopes(root: Float[Tensor, "pixels channels lights"], width: Tensor, n_d: Tensor | float) -> BodySlopes:
@@ -129,7 +133,8 @@ def jacobians(
     pictures = K[:, : channels * lights].view(pixels, channels, lights, -1)
     pictures[..., :3] = (pull * shine.by_u[:, None])[..., None] * obs.alpha
     pictures[..., LOG_N_S] = pull * shine.by_log_n_s[:, None]
-    pictures[..., ROOT_HAZE] = pull * shine.by_root_haze[:, None]
+    if bool(shared[GGX] > 0):
+        pictures[..., LOG_C_2] = pull * shine.by_log_crest[:, None]
     pictures[..., SOFTNESS] = pull * body.by_width * edge_width(obs.s_basis, shared.new_ones(()))
     if obs.n_d is None:
         pictures[..., LOG_N_D] = pull * body.by_log_n_d
@@ -167,7 +172,7 @@ def alpha_columns(
     lobe_root = g.a + x.B[:, None] * x.d.mean(1)
     by_alpha = body.by_root[..., 3:, None] * mixed_root + (shine.by_u[:, 3:, None] * lobe_root[:, None])[:, None]
     u = lobe_root @ obs.alpha.mT
-    model = diffuse(root, edge_width(obs.s_basis, shared[SOFTNESS]), g.n_d) + lobe(u, g.n_s, g.haze)[:, None]
+    model = diffuse(root, edge_width(obs.s_basis, shared[SOFTNESS]), g.n_d) + lobe(u, g.n_s, g.crest)[:, None]
     mixed = mixing_of(stated, shared)
     slopes = (pull / mixed.intensity)[..., 3:, None] * by_beta(mixed, model, by_alpha)
     for j in range(slopes.shape[2]):

@@ -30,9 +30,9 @@ class FitOptions:
     lambda_other: float = 2.0
     robust: Literal["huber", "none"] = "huber"
     """Loss of the pictures' residuals."""
-    lobe: Literal["auto", "haze", "single"] = "auto"
-    """Soft shadow edges where the pictures ask for them; a haze around the highlight besides, which needs scattering
-    known to a per cent or it takes diffuse light for haze; or the paper's formula alone."""
+    lobe: Literal["auto", "ggx", "cosine", "single"] = "auto"
+    """The lobe of GGX microfacets or the paper's power of a cosine, whichever the pictures ask for, or one of them;
+    soft shadow edges where they pay. Or the paper's formula alone, the power with hard edges."""
     prior: Literal["auto", "none"] = "auto"
     """Priors of a strength taken from the data, or none but a bound on the lobe."""
     max_iterations: int = 20

@@ -56,7 +56,7 @@ def describe(
         n_s=g.n_s.float(),
         n_d=torch.as_tensor(g.n_d).float(),
         softness=g.softness.abs().float(),
-        haze=g.haze.float(),
+        crest=g.crest.float(),
         global_names=tuple(n for n, free in zip(names_of(stack, state), state.free.tolist(), strict=True) if free),
         covariance=covariance[state.free][:, state.free],
         d=picture(x.d),

@@ -1,7 +1,10 @@
 """Eqs. 20 to 22 as a least-squares problem of blocks: one block a pixel.
 
     local   l = (d_11, d_12, d_13, d_21, ...; log B [; s_11, ...])       channel-major; 3 C + 1 [+ 3 C] numbers
-    shared  g = (a_1, a_2, a_3, log n_s, log C_2, softness, sqrt haze, log n_d [; delta_41, delta_42, ...])
+    shared  g = (a_1, a_2, a_3, log n_s, log C_2, softness, ggx, log n_d [; delta_41, delta_42, ...])
+
+ggx is 1 where the lobe is that of GGX microfacets and 0 where it is the paper's power; it is chosen, never solved for.
+The crest of such a lobe is C_2 / 2, its argument in the mirror direction.
 
 Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel and light, then the priors' rows:
 
@@ -25,8 +28,8 @@ from torch import Tensor
 from reflectsep.fit.mixing import Mixing, mixing
 from reflectsep.model import Globals, edge_width, reflectance
 
-SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "root_haze", "log_n_d")
-LOG_N_S, LOG_C_2, SOFTNESS, ROOT_HAZE, LOG_N_D = 3, 4, 5, 6, 7
+SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "ggx", "log_n_d")
+LOG_N_S, LOG_C_2, SOFTNESS, GGX, LOG_N_D = 3, 4, 5, 6, 7
 ALPHA = len(SHARED_NAMES)
 """Where what is added to the stated alphas begins, if they are refined."""
 
@@ -131,8 +134,6 @@ class Priors:
     n_d_sd: float = 0.05
     """n_d by the sweeps, and the standard deviation of its logarithm."""
     softness_sd: float = 0.3
-    haze_sd: float = 0.3
-    """Standard deviation of sqrt(haze)."""
     alpha_sd: float = 0.02
     """Standard deviation of a stated alpha, of lights of unit intensity."""
 
@@ -240,7 +241,7 @@ def unpack_globals(shared: Float[Tensor, "G"], n_d: float | None) -> Globals:
         n_s=shared[LOG_N_S].exp(),
         n_d=shared[LOG_N_D].exp() if n_d is None else n_d,
         softness=shared[SOFTNESS],
-        haze=shared[ROOT_HAZE].square(),
+        crest=shared[GGX] * 0.5 * shared[LOG_C_2].exp(),
     )
 
 
@@ -328,7 +329,6 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
             (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.exponent_sd,
             (shared[LOG_N_D] - priors.log_n_d) / priors.n_d_sd,
             shared[SOFTNESS] / priors.softness_sd,
-            shared[ROOT_HAZE] / priors.haze_sd,
             *(shared[ALPHA:] / priors.alpha_sd),
         ]
     )

@@ -1,7 +1,7 @@
 """The fit of a capture: pictures and scattering in, parameters of every pixel with their certainty out.
 
 robust body -> grid and joint fit of the globals on telling pixels -> search over B of every pixel
--> lobes handed on between neighbours -> everything jointly -> haze, soft shadows and neighbourhood, jointly again
+-> lobes handed on between neighbours -> everything jointly -> soft shadows and neighbourhood, jointly again
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.outcome import describe, picture_residual, shine_of
 from reflectsep.fit.problem import (
     ALPHA,
+    GGX,
     LOG_C_2,
-    ROOT_HAZE,
     SOFTNESS,
     Observations,
+    Priors,
     no_priors,
     unpack,
 )
@@ -66,8 +67,10 @@ HUBER = 5.0
 MIN_PICTURES = {"measured": 6, "none": 6, "unknown": 8}
 N_D_SD, N_D_SD_LEAST = 0.05, 0.01
 """Relative standard deviation of n_d: of 1 where no sweep tells, and the least that a sweep's is taken to have."""
+LOBES = {"auto": (0.0, 1.0), "ggx": (1.0,), "cosine": (0.0,), "single": (0.0,)}
+"""Lobes to try, as `problem.GGX` has them; the pictures choose."""
 EXTENSION_GAIN = 0.01
-"""Soft shadows and the haze stay only where they lower the whole cost by this share."""
+"""Soft shadows stay only where they lower the whole cost by this share."""
 
 
 def fit_reflectance(
@@ -265,8 +268,13 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
 
     n_s = GRID_N_S if options.n_s is None else (options.n_s,)
     part, priors = obs.take(index), state.priors.take(index)
-    first = state.shared
-    starts = globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
+
+    def best_of_grid(priors: Priors, ggx: float) -> list[Tensor]:
+        first = state.shared.clone()
+        first[GGX] = ggx
+        return globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
+
+    starts = [start for ggx in LOBES[options.lobe] for start in best_of_grid(priors, ggx)]
     state = replace(state, shared=globals_from(state, starts))
     if options.prior == "auto":
         part, priors = state.obs.take(index), state.priors.take(index)
@@ -276,7 +284,7 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         spread = shape_spread(part.take(good), found.local[good], state.shared, shine, state.sigma)
         state = replace(state, priors=replace(state.priors, shape=1.0 / spread))
         # Under the firmer prior another start may lead lower.
-        again = globals_grid(part, state.priors.take(index), first, n_s, trim=effort.trim, best=effort.starts)
+        again = best_of_grid(state.priors.take(index), float(state.shared[GGX]))
         state = replace(state, shared=globals_from(state, [state.shared, *again]))
     progress("pixels", 0, 3)
     found = fit_locals(obs, state.priors, state.shared, effort, state.robust)
@@ -314,7 +322,7 @@ def with_noise(state: State, options: FitOptions, sigma: float) -> State:
 
 
 def refine(state: State, options: FitOptions, progress: Progress) -> State:
-    """Everything jointly; then haze and soft shadows where they pay; then the neighbourhood's say."""
+    """Everything jointly; then soft shadows where they pay; then the neighbourhood's say."""
     if options.alpha_sd > 0:
         # Only now: a handful of pixels would lead alphas astray before the lobe is known.
         free = state.free.clone()
@@ -322,7 +330,7 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
         state = replace(state, free=free)
     state = joint_step(state, "joint fit", progress)
     if options.lobe != "single":
-        state = try_extensions(state, options, progress)
+        state = try_soft_edges(state, progress)
     if bool((state.priors.parallel > 0).any()):
         for i in range(2):
             x = unpack(state.found.local, state.obs.channels)
@@ -393,16 +401,13 @@ def hand_on(state: State, radius: int) -> State:
     return replace(state, found=found)
 
 
-def try_extensions(state: State, options: FitOptions, progress: Progress) -> State:
-    """Free soft shadows, and the haze if wanted; keep them only if the cost falls by more than `EXTENSION_GAIN`."""
+def try_soft_edges(state: State, progress: Progress) -> State:
+    """Free soft shadows where there is scattering; keep them only if the cost falls by more than `EXTENSION_GAIN`."""
+    if not any(bool((state.obs.s[cut] != 0).any()) for cut in cuts(len(state.obs))):
+        return state
     before = float(state.found.cost.sum())
     shared, free = state.shared.clone(), state.free.clone()
-    if options.lobe == "haze":
-        shared[ROOT_HAZE], free[ROOT_HAZE] = 0.2, True
-    if any(bool((state.obs.s[cut] != 0).any()) for cut in cuts(len(state.obs))):
-        shared[SOFTNESS], free[SOFTNESS] = 0.12, True
-    if bool((free == state.free).all()):
-        return state
+    shared[SOFTNESS], free[SOFTNESS] = 0.12, True
     trial = joint_step(rescored(replace(state, shared=shared, free=free)), "shadow edges", progress)
     after = float(trial.found.cost.sum())
     kept = math.isfinite(after) and after < before * (1.0 - EXTENSION_GAIN)

@@ -27,12 +27,12 @@ from reflectsep.fit.problem import (
     unpack_globals,
 )
 from reflectsep.model import (
-    HAZE_RATIO,
     Globals,
     diffuse,
     edge_width,
     lobe,
-    positive_power,
+    lobe_reaches,
+    lobe_slope,
     reflectance,
     signed_root,
 )
@@ -67,27 +67,23 @@ def basis_roots(
 ) -> Float[Tensor, "*pixels 3"]:
     """d_k of pos(d_k + s_k)^n_d + lobe(a_k + B d_k) = I_k, by Newton from above, halving where that leaves the bracket.
 
-    The left side rises with d_k, and is convex but for a haze of an exponent below 1.
+    The left side rises with d_k, and is convex.
     """
     target = target.clamp_min(1e-5)
     root = target ** (1.0 / float(shared.n_d))
     alone = root - width.square() / (4.0 * root)  # the root if there were no lobe
-    high = torch.minimum(alone - s, (target ** (1.0 / shared.n_s) - shared.a) / B)
+    high = torch.minimum(alone - s, (lobe_reaches(target, shared.n_s, shared.crest) - shared.a) / B)
     low = torch.minimum(high, -shared.a / B)  # no lobe here, and no more light of the body than there is in all
     d = high
-    n_d, hazy = float(shared.n_d), float(shared.haze) > 0
+    n_d = float(shared.n_d)
     for _ in range(iterations):
         x = d + s
         length = (x.square() + width.square() + 1e-20).sqrt()
         lit = 0.5 * (x + length)
         u = (shared.a + B * d).clamp_min(0.0)
-        shine = lobe(u, shared.n_s, shared.haze)
-        value = lit**n_d + shine - target
+        value = lit**n_d + lobe(u, shared.n_s, shared.crest) - target
         slope = n_d * lit.clamp_min(1e-12) ** (n_d - 1.0) * 0.5 * (1.0 + x / length)
-        rise = shine
-        if hazy:
-            rise = shine - (1.0 - 1.0 / HAZE_RATIO) * shared.haze * positive_power(u, shared.n_s / HAZE_RATIO)
-        slope = slope + B * shared.n_s * rise / u.clamp_min(1e-12)
+        slope = slope + B * lobe_slope(u, shared.n_s, shared.crest)
         low, high = torch.where(value < 0, d, low), torch.where(value < 0, high, d)
         step = d - value / slope.clamp_min(1e-4)
         d = torch.where((step < low) | (step > high), 0.5 * (low + high), step)
@@ -150,7 +146,7 @@ def colour_roots(
     """Roots of every channel once the lobe is known from the mean: what the lobe leaves of the picture is diffuse."""
     if obs.channels == 1:
         return d_mean[..., None, :]
-    shine = lobe(globals_.a + B[..., None] * d_mean, globals_.n_s, globals_.haze)
+    shine = lobe(globals_.a + B[..., None] * d_mean, globals_.n_s, globals_.crest)
     rest = obs.images[:, None, :, :3] - shine[..., None, :]
     return signed_root(rest, float(globals_.n_d)) - obs.s_basis[:, None]
 

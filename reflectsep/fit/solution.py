@@ -15,8 +15,6 @@ from reflectsep.fit.neighbours import local_median
 from reflectsep.fit.problem import (
     LOG_N_D,
     LOG_N_S,
-    ROOT_HAZE,
-    SOFTNESS,
     Locals,
     Observations,
     Priors,
@@ -259,7 +257,7 @@ def with_that_lobe(
     obs = obs.take(which)
     x = unpack(local[which], obs.channels)
     globals_ = unpack_globals(shared, obs.n_d)
-    shine = lobe(globals_.a + lobe_vector, globals_.n_s, globals_.haze)
+    shine = lobe(globals_.a + lobe_vector, globals_.n_s, globals_.crest)
     s = obs.s_basis if x.s is None else x.s
     d = signed_root(obs.images[..., :3] - shine[:, None], float(globals_.n_d)) - s
     # Where a basis light leaves the patch dark the root says nothing; keep the pixel's own.
@@ -280,18 +278,17 @@ def worth_trying(
         x, g = unpack(local[cut], obs.channels), unpack_globals(shared, obs.n_d)
         own = x.B[:, None] * x.d.mean(1)
         same = (other - own).norm(dim=-1) <= SAME_LOBE * own.norm(dim=-1)
-        peak = lambda v: (lobe((g.a + v) @ part.alpha.mT, g.n_s, g.haze) * part.weight.mean(1)).amax(-1)  # noqa: E731
+        peak = lambda v: (lobe((g.a + v) @ part.alpha.mT, g.n_s, g.crest) * part.weight.mean(1)).amax(-1)  # noqa: E731
         return ~same & ((peak(own) > UNSEEN) | (peak(other) > UNSEEN))
 
     return in_chunks(len(local), worth).nonzero()[:, 0]
 
 
 def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) -> Float[Tensor, "8"]:
-    """Shared unknowns before any search: hard shadows, no haze."""
+    """Shared unknowns before any search: hard shadows, the paper's lobe."""
     shared = like.new_zeros(8)
     shared[:3] = -0.9 * cosine
     shared[LOG_N_S] = torch.log(like.new_tensor(12.0 if n_s is None else n_s))
-    shared[SOFTNESS], shared[ROOT_HAZE] = 0.0, 0.0
     shared[LOG_N_D] = torch.log(like.new_tensor(n_d))
     return shared
 
@@ -299,4 +296,4 @@ def initial_shared(like: Tensor, cosine: Tensor, n_d: float, n_s: float | None) 
 def lobe_pictures(obs: Observations, local: Tensor, shared: Tensor) -> Float[Tensor, "pixels lights"]:
     """Off-specular value of every pixel and light."""
     x, g = unpack(local, obs.channels), unpack_globals(shared, obs.n_d)
-    return lobe(lobe_argument(x.d, x.B, g.a, alpha_of(obs, shared)), g.n_s, g.haze)
+    return lobe(lobe_argument(x.d, x.B, g.a, alpha_of(obs, shared)), g.n_s, g.crest)

@@ -83,7 +83,11 @@ def global_parameters(separation: Separation, stack: PhotometricStack | None) ->
         ("n_s", n_s, "exponent of the lobe: the larger, the glossier"),
         ("n_d", float(separation.n_d), "exponent of the diffuse part"),
         ("softness", float(separation.softness), "width of the shadow's edge, of the mean scattering root; 0: hard"),
-        ("haze", float(separation.haze), "height of the lobe's haze; 0: none"),
+        (
+            "crest",
+            float(separation.crest),
+            "of a GGX lobe: its argument in the mirror direction; 0: a power",
+        ),
     ]
     n_d_sd, source = separation.document.get("n_d_sd"), separation.document.get("n_d_source")
     held = {"n_d": f"± {n_d_sd:.2g}, by the sweeps" if n_d_sd and source == "estimated" else f"{source}"}

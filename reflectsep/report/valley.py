@@ -83,7 +83,7 @@ class _Case:
         width = edge_width(self.s[:, None], self.separation.softness.double())[..., 0]
         body = diffuse((d + self.s) @ self.alpha.mT, width, self.separation.globals.n_d)
         u = (a + B[..., None] * d) @ self.alpha.mT
-        return body + lobe(u, self.separation.n_s.double(), self.separation.haze.double()) - self.I
+        return body + lobe(u, self.separation.n_s.double(), self.separation.crest.double()) - self.I
 
     def refitted(self, x: Float[Tensor, "*grid pixels unknowns"], a: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
         """`x` after Gauss-Newton from there, and the mean square misfit of every pixel and place of the grid."""

@@ -160,7 +160,7 @@ def description(shown: Shown, accuracy: Accuracy) -> dict[str, Any]:
         "white": shown.white,
         "lights": lights,
         "basis": None if vectors is None else vectors[:3].tolist(),
-        "globals": {key: getattr(separation, key).tolist() for key in ("a", "n_s", "n_d", "softness", "haze")},
+        "globals": {key: getattr(separation, key).tolist() for key in ("a", "n_s", "n_d", "softness", "crest")},
         "flag_counts": count(separation.flags),
         "flag_values": {str(flag.name): int(flag) for flag in Flag},
         "accuracy": {

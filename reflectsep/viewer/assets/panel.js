@@ -132,11 +132,18 @@ function about_result(about) {
   const rows = [
     ["result", about.name], ["object", about.object], ["model", about.model], ["made", about.created], ["size", `${size_text} pixels`],
     ["n_s", round(g.n_s)], ["n_d", `${round(g.n_d, 4)} (${about.n_d_source})`], ["a", g.a.map(v => round(v)).join(", ")],
-    ["shadow softness", round(g.softness)], ["haze", round(g.haze)], ["white", `${round(about.white)} in the capture's units, at exposure 0`],
+    ["shadow softness", round(g.softness)], ["lobe", g.crest > 0 ? "GGX microfacets" : "power of a cosine"], ["white", `${round(about.white)} in the capture's units, at exposure 0`],
     ["stored as", `16-bit floats: basis lights ${error.psnr_db === null ? "exact" : error.psnr_db.toFixed(1) + " dB"} from the result, ${(100 * error.within_one).toFixed(2)} % of the values within one of 255 steps, at most ${error.largest}`],
     ...about.warnings.map(text => ["warning", text]),
   ];
   return table(rows.filter(([, text]) => text !== ""));
+}
+
+function lobe(u, n, crest) {
+  if (!(u > 0)) return 0;
+  if (!(crest > 0)) return u ** n;
+  const v = u / crest, w = 1 + n * (1 - Math.min(v, 1)) / 2, least = 1 + n / 2;
+  return crest ** n * ((v > 1 ? v ** n : w ** -2) - least ** -2);
 }
 
 // Linear value of the whole picture at a pixel, the formula of the shader in double precision.
@@ -146,7 +153,7 @@ function value_of(result, pixel) {
   return pixel.d.map((d, c) => lights_on(result).reduce((sum, light) => {
     const f_d = power(state.loc, 1 / g.n_d), f_s = power(state.scat, 1 / g.n_d), s = pixel.s[c], u = dot(pixel.w, light.alpha);
     const root = dot(d.map((v, k) => f_d * v + f_s * s[k]), light.alpha), edge = f_s * g.softness * Math.max(0, (s[0] + s[1] + s[2]) / 3);
-    const shine = power(u, n_s) + g.haze * power(u, n_s / 8);
+    const shine = lobe(u, n_s, g.crest);
     return sum + light.power * (state.spec * shine + power((root + Math.hypot(root, edge)) / 2, g.n_d));
   }, 0));
 }

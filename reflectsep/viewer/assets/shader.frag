@@ -5,7 +5,7 @@ uniform sampler2DArray planes;    // per channel (d, B), per channel (s, low fla
 uniform sampler2DArray measured;  // one layer a light, sRGB codes
 uniform vec3 alpha[2];            // of lights of unit intensity
 uniform float power[2];           // their intensities
-uniform vec4 globals;             // n_s, n_d, softness, haze
+uniform vec4 globals;             // n_s, n_d, softness, crest
 uniform float root_scale;
 uniform float lobe_scale;         // of B
 uniform vec3 faders;              // of the specular, and of the roots of local diffuse and scattering
@@ -25,7 +25,6 @@ out vec4 colour;
 
 // SHOW: 0 whole, 1 specular, 2 local diffuse, 3 scattering, 4 whole diffuse, 5 measured, 6 B, 7 flags
 const int MEASURED = 5, STRENGTH = 6, FLAGS = 7;
-const float HAZE_RATIO = 8.0;
 
 float positive_power(float base, float exponent) {
   if (!(base > 0.0)) return 0.0;
@@ -35,10 +34,13 @@ float positive_power(float base, float exponent) {
 // (x + sqrt(x^2 + e^2)) / 2: max(x, 0) with an edge of width e
 float soft_positive(float x, float e) { return 0.5 * (x + sqrt(x * x + e * e)); }
 
-// off-specular value of u = A (a + B d), Eq. 17
+// off-specular value of u = A (a + B d): Eq. 17, or the lobe of GGX microfacets where there is a crest
 float lobe(float u) {
-  float haze = globals.w > 0.0 ? globals.w * positive_power(u, globals.x / HAZE_RATIO) : 0.0;
-  return positive_power(u, globals.x) + haze;
+  float n = globals.x, crest = globals.w;
+  if (!(crest > 0.0)) return positive_power(u, n);
+  if (!(u > 0.0)) return 0.0;
+  float v = u / crest, w = 1.0 + 0.5 * n * (1.0 - min(v, 1.0)), least = 1.0 + 0.5 * n;
+  return pow(crest, n) * ((v > 1.0 ? pow(v, n) : 1.0 / (w * w)) - 1.0 / (least * least));
 }
 
 // Eqs. 20 and 21 of one channel under one light
