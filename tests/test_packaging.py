@@ -83,7 +83,7 @@ def test_scripts_are_the_jobs(job):
 
 
 def test_there_is_one_script_a_job():
-    measuring = ("benchmark", "scaling", "sweep_speed")
+    measuring = ("benchmark", "fit_memory", "scaling", "sweep_speed")
     assert sorted(path.stem for path in (ROOT / "scripts").glob("*.py")) == sorted([*JOBS, *measuring])
     assert sorted(path.stem for path in (ROOT / "configs").glob("*.yaml")) == sorted(f"{job}_job" for job in JOBS)
 
