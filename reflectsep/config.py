@@ -144,7 +144,7 @@ class FitSettings:
     lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
     lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)
     scattering_sd: float = setting(
-        0.03, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
+        0.06, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
     )
     robust: Literal["huber", "none"] = setting("huber", "loss that weighs cast shadows down")
     lobe: Literal["auto", "ggx", "cosine", "single"] = setting(

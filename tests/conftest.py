@@ -16,7 +16,7 @@ settings.register_profile("reflectsep", deadline=None)
 settings.load_profile("reflectsep")
 
 
-def make_result(*, size=64, channels=3, n_d=1.2, softness=0.2, haze=0.02, known=True, unit=1.0):
+def make_result(*, size=64, channels=3, n_d=1.2, softness=0.2, crest=0.85, known=True, unit=1.0):
     """A result whose parameters are those of a bumpy surface; a disc of it is the object.
 
     `unit` scales the pictures, as another camera's units would.
@@ -48,7 +48,7 @@ def make_result(*, size=64, channels=3, n_d=1.2, softness=0.2, haze=0.02, known=
         n_s=torch.tensor(truth.n_s),
         n_d=torch.tensor(n_d),
         softness=torch.tensor(softness),
-        haze=torch.tensor(haze),
+        crest=torch.tensor(crest * unit ** (1.0 / truth.n_s)),
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=truth.d.float() * root * mask,

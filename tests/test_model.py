@@ -1,17 +1,20 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from reflectsep.model import (
-    HAZE_RATIO,
     Globals,
     diffuse,
     edge_width,
     lobe,
     lobe_argument,
+    lobe_reaches,
+    lobe_slope,
     positive_power,
     reflectance,
     signed_root,
@@ -25,11 +28,11 @@ def double(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def some_pixels(pixels=5, channels=2, lights=6, softness=0.0, haze=0.0, n_d=1.3):
+def some_pixels(pixels=5, channels=2, lights=6, softness=0.0, crest=0.0, n_d=1.3):
     g = torch.Generator().manual_seed(4)
     rand = lambda *n: torch.rand(*n, generator=g, dtype=torch.float64)  # noqa: E731
     shared = Globals(
-        a=double(-0.9, -0.8, -0.95), n_s=double(7.0)[0], n_d=n_d, softness=double(softness)[0], haze=double(haze)[0]
+        a=double(-0.9, -0.8, -0.95), n_s=double(7.0)[0], n_d=n_d, softness=double(softness)[0], crest=double(crest)[0]
     )
     alpha = torch.cat([torch.eye(3, dtype=torch.float64), 1.5 * rand(lights - 3, 3) - 0.3])
     # Some patches face away, some lobes are dark.
@@ -38,7 +41,7 @@ def some_pixels(pixels=5, channels=2, lights=6, softness=0.0, haze=0.0, n_d=1.3)
 
 
 def scalar_picture(  # noqa: PLR0917
-    d, s, B, shared, alpha, softness, haze, p, c, j
+    d, s, B, shared, alpha, softness, crest, p, c, j
 ):
     """Eqs. 20 and 21 for one pixel, channel and light, in plain numbers."""
     channels = d.shape[1]
@@ -50,20 +53,25 @@ def scalar_picture(  # noqa: PLR0917
         mean = sum(float(d[p, k, i]) for k in range(channels)) / channels
         u += float(alpha[j, i]) * (float(shared.a[i]) + float(B[p]) * mean)
     u, n_s = max(u, 0.0), float(shared.n_s)
-    return root ** float(shared.n_d) + u**n_s + haze * u ** (n_s / 8)
+    shine = u**n_s
+    if crest > 0 and u > 0:
+        least = 1 / (1 + n_s / 2) ** 2
+        tail = 1 / (1 + n_s * (1 - u / crest) / 2) ** 2 if u < crest else (u / crest) ** n_s
+        shine = crest**n_s * (tail - least)
+    return root ** float(shared.n_d) + shine
 
 
-@pytest.mark.parametrize(("softness", "haze"), [(0.0, 0.0), (0.3, 0.02)])
+@pytest.mark.parametrize(("softness", "crest"), [(0.0, 0.0), (0.3, 0.9)])
 @pytest.mark.parametrize("n_d", [1.0, 0.8, 1.6])
-def test_reflectance_is_equations_20_and_21(softness, haze, n_d):
-    d, s, B, shared, alpha = some_pixels(softness=softness, haze=haze, n_d=n_d)
+def test_reflectance_is_equations_20_and_21(softness, crest, n_d):
+    d, s, B, shared, alpha = some_pixels(softness=softness, crest=crest, n_d=n_d)
     width = edge_width(s[..., :3], shared.softness)
     pictures = reflectance(d, B, shared, s=s, alpha=alpha, width=width)
     assert pictures.shape == (5, 2, 6)
     for p in range(5):
         for c in range(2):
             for j in range(6):
-                expected = scalar_picture(d, s, B, shared, alpha, softness, haze, p, c, j)
+                expected = scalar_picture(d, s, B, shared, alpha, softness, crest, p, c, j)
                 assert float(pictures[p, c, j]) == pytest.approx(expected, rel=1e-10, abs=1e-12)
 
 
@@ -75,20 +83,21 @@ def test_the_example_has_both_sides_of_every_clamp():
 
 def test_a_fitted_n_d_of_one_gives_what_the_number_one_gives():
     d, s, B, shared, alpha = some_pixels(n_d=1.0)
-    fitted = Globals(a=shared.a, n_s=shared.n_s, n_d=double(1.0)[0], softness=shared.softness, haze=shared.haze)
+    fitted = Globals(a=shared.a, n_s=shared.n_s, n_d=double(1.0)[0], softness=shared.softness, crest=shared.crest)
     width = edge_width(s[..., :3], shared.softness)
     plain = reflectance(d, B, shared, s=s, alpha=alpha, width=width)
     torch.testing.assert_close(reflectance(d, B, fitted, s=s, alpha=alpha, width=width), plain)
 
 
-def test_gradients_are_those_of_finite_differences():
-    d, s, B, shared, alpha = some_pixels(pixels=3, softness=0.3, haze=0.02)
+@pytest.mark.parametrize("crest", [0.0, 0.9])
+def test_gradients_are_those_of_finite_differences(crest):
+    d, s, B, shared, alpha = some_pixels(pixels=3, softness=0.3, crest=crest)
 
-    def picture(d, s, B, a, n_s, n_d, softness, haze, alpha):  # noqa: PLR0917
-        g = Globals(a=a, n_s=n_s, n_d=n_d, softness=softness, haze=haze)
+    def picture(d, s, B, a, n_s, n_d, softness, crest, alpha):  # noqa: PLR0917
+        g = Globals(a=a, n_s=n_s, n_d=n_d, softness=softness, crest=crest)
         return reflectance(d, B, g, s=s, alpha=alpha, width=edge_width(s[..., :3], softness))
 
-    inputs = (d, s, B, shared.a, shared.n_s, double(1.3)[0], shared.softness, shared.haze, alpha)
+    inputs = (d, s, B, shared.a, shared.n_s, double(1.3)[0], shared.softness, shared.crest, alpha)
     inputs = tuple(x.clone().requires_grad_() for x in inputs)
     assert torch.autograd.gradcheck(picture, inputs)
     assert torch.autograd.gradcheck(picture, inputs, check_forward_ad=True, check_backward_ad=False)
@@ -137,10 +146,40 @@ def test_the_single_lobe_is_homogeneous(u, factor, n_s):
     )
 
 
-@given(st.floats(0, 3), st.floats(1, 60), st.floats(0, 0.5))
-def test_haze_adds_the_lobe_at_an_eighth_of_its_exponent(u, n_s, haze):
-    value = lobe(double(u), double(n_s), double(haze))
-    torch.testing.assert_close(value, double(u**n_s + haze * u ** (n_s / HAZE_RATIO)))
+@given(st.floats(0.1, 0.6), st.floats(0, 1.5))
+def test_the_lobe_with_a_crest_is_the_distribution_of_ggx(roughness, angle):
+    """Of microfacets whose normals lie at half the angle from the mirror direction (Walter et al., 2007, Eq. 33)."""
+
+    def distribution(t):
+        cosine = math.cos(t / 2)
+        return roughness**2 / (math.pi * (cosine**2 * (roughness**2 - 1) + 1) ** 2)
+
+    n_s = double(1 / roughness**2 - 1)
+    value = lobe(double(math.cos(angle)), n_s, double(1.0))
+    edge = distribution(math.pi / 2) / distribution(0)  # it is nothing from there on
+    torch.testing.assert_close(value, double(distribution(angle) / distribution(0) - edge))
+
+
+@given(st.floats(0.3, 1.2), st.floats(1, 60))
+def test_both_lobes_leave_the_crest_alike(crest, n_s):
+    at, off = double(crest), double(crest * 0.9999)
+    least = crest**n_s / (1 + n_s / 2) ** 2
+    zero = double(0.0)
+    for u, rel in ((at, 1e-9), (off, 1e-4)):
+        assert float(lobe(u, double(n_s), at)) + least == pytest.approx(float(lobe(u, double(n_s), zero)), rel=rel)
+
+
+@given(st.floats(-0.3, 1.5), st.floats(2, 60), st.sampled_from([0.0, 0.8]))
+def test_slope_and_inverse_of_the_lobe(u, n_s, crest):
+    n, C = double(n_s), double(crest)
+    x = double(u).requires_grad_()
+    value = lobe(x, n, C)
+    (slope,) = torch.autograd.grad(value, x)
+    torch.testing.assert_close(lobe_slope(x.detach(), n, C), slope)
+    if float(value.detach()) > 1e-9:
+        torch.testing.assert_close(lobe_reaches(value.detach(), n, C), x.detach())
+    else:
+        assert u <= 0.25 or n_s > 5
 
 
 @given(finite.filter(lambda x: x == 0 or abs(x) > 1e-30), st.floats(0.3, 3))

@@ -27,7 +27,7 @@ def some_vectors():
     return directions * torch.cat([BASIS_INTENSITY, torch.tensor([1.0, 2.0, 0.5])])[:, None]
 
 
-def make_separation(*, channels=1, n_d=1.0, softness=0.0, haze=0.0, known=True):
+def make_separation(*, channels=1, n_d=1.0, softness=0.0, crest=0.0, known=True):
     """A separation by `separate` from random parameters, with the stack and the scattering it came from."""
     g = torch.Generator().manual_seed(6)
     rand = lambda *n: torch.rand(*n, generator=g)  # noqa: E731
@@ -68,7 +68,7 @@ def make_separation(*, channels=1, n_d=1.0, softness=0.0, haze=0.0, known=True):
         n_s=torch.tensor(6.0),
         n_d=torch.tensor(n_d),
         softness=torch.tensor(softness),
-        haze=torch.tensor(haze),
+        crest=torch.tensor(crest),
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=(0.6 * rand(3, channels, HEIGHT, WIDTH) - 0.1) * mask,
@@ -86,19 +86,23 @@ def make_separation(*, channels=1, n_d=1.0, softness=0.0, haze=0.0, known=True):
     return separate(stack, scattering, fit, {"note": "made"}), stack, scattering, fit
 
 
-@pytest.fixture(params=[(1, 1.0, 0.0, 0.0), (3, 1.4, 0.2, 0.02)], ids=["grey", "colour"])
+@pytest.fixture(params=[(1, 1.0, 0.0, 0.0), (3, 1.4, 0.2, 0.85)], ids=["grey", "colour"])
 def made(request):
-    channels, n_d, softness, haze = request.param
-    return make_separation(channels=channels, n_d=n_d, softness=softness, haze=haze)
+    channels, n_d, softness, crest = request.param
+    return make_separation(channels=channels, n_d=n_d, softness=softness, crest=crest)
 
 
 def test_components_are_their_formulas(made):
     result, stack, scattering, fit = made
-    n_d, n_s, haze = float(fit.n_d), float(fit.n_s), float(fit.haze)
+    n_d, n_s, crest = float(fit.n_d), float(fit.n_s), float(fit.crest)
     for k in range(3):
         t = float(BASIS_INTENSITY[k])
         u = (fit.a[k] + fit.B.mean(0) * fit.d[k].mean(0)).clamp_min(0)
-        shine = t * (u**n_s + haze * u ** (n_s / 8)) * stack.mask
+        lobe = u**n_s
+        if crest > 0:
+            tail = torch.where(u < crest, (1 + n_s * (1 - u / crest) / 2) ** -2, (u / crest) ** n_s)
+            lobe = crest**n_s * torch.where(u > 0, tail - (1 + n_s / 2) ** -2, 0.0)
+        shine = t * lobe * stack.mask
         torch.testing.assert_close(result.specular[k], shine.expand_as(result.specular[k]), rtol=1e-4, atol=1e-6)
         local = t * fit.d[k].clamp_min(0) ** n_d * stack.mask
         torch.testing.assert_close(result.local_diffuse[k], local, rtol=1e-4, atol=1e-6)
@@ -194,7 +198,7 @@ def test_batches_keep_their_shape_and_their_pictures(made, lead):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_relighting_is_differentiable_in_alpha(known):
-    result, *_ = make_separation(channels=3, n_d=1.4, softness=0.2, haze=0.02, known=known)
+    result, *_ = make_separation(channels=3, n_d=1.4, softness=0.2, crest=0.85, known=known)
     values = {f.name: getattr(result, f.name) for f in fields(result)}
     exact = Separation(
         **{k: v.double() if isinstance(v, torch.Tensor) and v.is_floating_point() else v for k, v in values.items()}
@@ -236,7 +240,7 @@ def assert_same(left: Separation, right: Separation):
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_a_saved_result_comes_back_bit_for_bit(tmp_path, channels, known):
-    result, *_ = make_separation(channels=channels, n_d=1.4, softness=0.2, haze=0.02, known=known)
+    result, *_ = make_separation(channels=channels, n_d=1.4, softness=0.2, crest=0.85, known=known)
     result.save(tmp_path / "result")
     back = load(tmp_path / "result")
     assert_same(result, back)
@@ -304,7 +308,7 @@ def drop(name):
         lambda document: document["lights"]["a"].pop("alpha"),
         lambda document: document["lights"]["a"].update(alpha=[1.0, 2.0]),
         lambda document: document.update(lights=[]),
-        lambda document: document["globals"].update(haze=float("nan")),
+        lambda document: document["globals"].update(crest=float("nan")),
     ],
 )
 def test_a_document_that_does_not_fit_the_layers_is_refused(tmp_path, edit):

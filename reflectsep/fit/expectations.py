@@ -31,8 +31,9 @@ from reflectsep.solve.local import normal_equations
 
 SHAPE_SD = 0.1
 """Scatter of log B about its geometric value before anything is known of it; 0.2 where the lights are unknown."""
-SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.02, 0.015, 0.01
-"""No prior is taken to be firmer than this: what lies below is the accuracy of the model itself."""
+SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.005, 0.015, 0.01
+"""No prior is taken to be firmer than this: what lies below is the accuracy of the model itself. The shape's is small,
+for the lobe's peak goes with the power 2 n_s of B: a scatter of 0.005 is one of a third in the peak of n_s 30."""
 PARALLEL_SD_MOST = 0.06
 """Beyond this scatter the direction of s says nothing of that of d."""
 RATIO_SIGMA_PX = 3.0
@@ -42,7 +43,7 @@ RATIO_BREAK = 4.0
 """From about this many standard deviations off its neighbourhood on a pixel is of another material."""
 HEIGHT_FACTOR = 2.0
 """Peak of the lobe that is believed, over the largest value above the robust body, which takes some of it."""
-FACING_SD, FACING_SD_LEAST = 0.1, 0.03
+FACING_SD, FACING_SD_LEAST = 0.03, 0.01
 """Scatter of the direction of d about that of d + s, in radians: at most, where it cannot be learnt, and at least."""
 FACING_SIGMA_PX = 3.0
 """Over such a distance scattering mixes normals: where they turn within it, d + s says less of d."""

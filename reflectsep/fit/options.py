@@ -12,10 +12,10 @@ class FitOptions:
     """All parameters together, or globals on chosen pixels first and then every pixel on its own (paper, section 5)."""
     scattering: Literal["measured", "none", "unknown"] = "measured"
     """s from the sweeps; left out (Lin & Lee); or fitted, seven unknowns a pixel (n >= 8)."""
-    scattering_sd: float = 0.03
+    scattering_sd: float = 0.06
     """Relative standard deviation of the measured s, beside the noise of its frames. d is what the small difference
-    between the picture and s leaves, so an error of 3 % in s is one of 10 % in d; s is fitted within this. 0 holds s
-    as measured: the paper's four unknowns a pixel."""
+    between the picture and s leaves, so an error of 3 % in s is one of 10 % in d, and of as much in the direction that
+    d gives the lobe; s is fitted within this. 0 holds s as measured: the paper's four unknowns a pixel."""
     n_s: float | None = None
     """Fixed exponent of the lobe; None: fitted."""
     refine_n_d: bool = False

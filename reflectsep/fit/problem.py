@@ -241,7 +241,7 @@ def unpack_globals(shared: Float[Tensor, "G"], n_d: float | None) -> Globals:
         n_s=shared[LOG_N_S].exp(),
         n_d=shared[LOG_N_D].exp() if n_d is None else n_d,
         softness=shared[SOFTNESS],
-        crest=shared[GGX] * 0.5 * shared[LOG_C_2].exp(),
+        crest=(shared[GGX] > 0).to(shared.dtype) * 0.5 * shared[LOG_C_2].exp(),
     )
 
 

@@ -43,7 +43,7 @@ class PaperCase:
 
     def relit(self, fit: Fit) -> Tensor:
         """Pictures of the held-out lights by the fit; basis lights are of unit intensity in these rigs."""
-        shared = Globals(a=fit.a, n_s=fit.n_s, n_d=float(fit.n_d), softness=fit.softness, haze=fit.haze)
+        shared = Globals(a=fit.a, n_s=fit.n_s, n_d=float(fit.n_d), softness=fit.softness, crest=fit.crest)
         alpha = self.heldout.float()
         d, s = fit.d.permute(2, 3, 1, 0), fit.s[:3].permute(2, 3, 1, 0)
         width = fit.softness * s.mean(-1, keepdim=True)

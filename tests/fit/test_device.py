@@ -75,7 +75,7 @@ def test_the_pretended_device_tells_what_is_not_on_it():
 
 
 @pytest.mark.parametrize(
-    "options", [{}, pytest.param({"alpha_sd": 0.02, "lobe": "haze", "refine_n_d": True}, marks=pytest.mark.slow)]
+    "options", [{}, pytest.param({"alpha_sd": 0.02, "lobe": "ggx", "refine_n_d": True}, marks=pytest.mark.slow)]
 )
 def test_chunks_are_worked_on_wholly_on_the_device(paper_case, monkeypatch, options):
     # One start and one round each: what is tested is where, not how well.

@@ -130,7 +130,7 @@ def test_two_steps_alone_recover_clean_pictures(quick_fit, small_case):
     assert float((((D - truth).abs() < 0.01 * truth.amax(0)).all(0)[0])[sees].float().mean()) > 0.95
     assert float((quick_fit.a / small_case.truth.a - 1).abs().max()) < 0.05
     assert float(quick_fit.n_s) == pytest.approx(small_case.truth.n_s, rel=0.05)
-    assert quick_fit.haze == 0
+    assert quick_fit.crest == 0
     assert quick_fit.softness == 0
     assert small_case.psnr(quick_fit) > 35
 

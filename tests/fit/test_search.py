@@ -20,7 +20,7 @@ def double(x):
 
 
 @settings(max_examples=300)
-@example(target=0.01, s=0.0, B=12.0, a=-0.6, n_s=3.0, n_d=1.5, width=0.0, haze=0.03)
+@example(target=0.01, s=0.0, B=12.0, a=-0.6, n_s=3.0, n_d=1.5, width=0.0, crest=0.9)
 @given(
     target=number(0.01, 1.5),
     s=number(0, 0.4),
@@ -29,13 +29,13 @@ def double(x):
     n_s=number(3, 60),
     n_d=st.sampled_from([1.0, 0.7, 1.5]),
     width=st.sampled_from([0.0, 0.05]),
-    haze=st.sampled_from([0.0, 0.03]),
+    crest=st.sampled_from([0.0, 0.9]),
 )
-def test_basis_roots_solve_their_equation(target, s, B, a, n_s, n_d, width, haze):
-    shared = Globals(a=double([a] * 3), n_s=double(n_s), n_d=n_d, softness=double(0.0), haze=double(haze))
+def test_basis_roots_solve_their_equation(target, s, B, a, n_s, n_d, width, crest):
+    shared = Globals(a=double([a] * 3), n_s=double(n_s), n_d=n_d, softness=double(0.0), crest=double(crest))
     images, edge = double([target] * 3), double([width])
     d = basis_roots(images, double([s] * 3), double([B]), shared, edge, iterations=60)
-    shine = lobe((shared.a + B * d).clamp_min(0), shared.n_s, shared.haze)
+    shine = lobe((shared.a + B * d).clamp_min(0), shared.n_s, shared.crest)
     torch.testing.assert_close(diffuse(d + s, edge, n_d) + shine, images, rtol=1e-6, atol=1e-7)
 
 
@@ -120,7 +120,7 @@ def test_colour_roots_leave_the_lobe_out(paper_case):
     d, B = truth.d[..., mask].permute(2, 1, 0), truth.B[..., mask].T
     mean = d.mean(1)
     B_grey = (B[:, :1] * d[:, 0] / mean)[:, :1]
-    shared = Globals(a=truth.a, n_s=double(truth.n_s), n_d=1.0, softness=double(0.0), haze=double(0.0))
+    shared = Globals(a=truth.a, n_s=double(truth.n_s), n_d=1.0, softness=double(0.0), crest=double(0.0))
     found = colour_roots(obs, mean[:, None], B_grey, shared)
     assert found.shape == (len(obs), 1, 3, 3)
     lit = (d > 0).all(-1).all(-1)

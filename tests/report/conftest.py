@@ -33,7 +33,7 @@ def exact():
         n_s=torch.tensor(truth.n_s),
         n_d=torch.tensor(1.0),
         softness=torch.tensor(0.0),
-        haze=torch.tensor(0.0),
+        crest=torch.tensor(0.0),
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=truth.d.float(),

@@ -147,14 +147,14 @@ def test_the_command_names_what_is_not_the_default(exact):
         "capture": "/data/my wax",
         "heldout": ["L7"],
         "settings": {
-            "fit": {"lobe": "haze", "chunk": FitSettings().chunk, "n_s": None},
+            "fit": {"lobe": "ggx", "chunk": FitSettings().chunk, "n_s": None},
             "scatter": {"distance_px": 2.0},
         },
     }
     said = command(dataclasses.replace(separation, document=document), "out")
     assert said == (
         "reflectsep fit 'capture=/data/my wax' out=out 'basis=[L1,L2,L3]' 'heldout=[L7]' "
-        "fit.lobe=haze scatter.distance_px=2.0"
+        "fit.lobe=ggx scatter.distance_px=2.0"
     )
 
 
@@ -173,17 +173,17 @@ def test_frames_to_show_are_those_that_were_asked_for(flat):
 
 
 @pytest.mark.parametrize(
-    ("softness", "haze", "said"),
+    ("softness", "crest", "said"),
     [
         (0.0, 0.0, ""),
         (0.2, 0.0, "soft shadow edges lowered the cost and were kept"),
-        (0.0, 0.1, "a haze lowered the cost and was kept"),
-        (0.2, 0.1, "soft shadow edges and a haze lowered the cost and were kept"),
+        (0.0, 0.1, "the lobe of GGX microfacets lowered the cost and was kept"),
+        (0.2, 0.1, "soft shadow edges and the lobe of GGX microfacets lowered the cost and were kept"),
     ],
 )
-def test_only_extensions_that_are_there_are_named(exact, tmp_path, softness, haze, said):
+def test_only_extensions_that_are_there_are_named(exact, tmp_path, softness, crest, said):
     separation, _ = exact
-    made = dataclasses.replace(separation, softness=torch.tensor(softness), haze=torch.tensor(haze))
+    made = dataclasses.replace(separation, softness=torch.tensor(softness), crest=torch.tensor(crest))
     write_report(tmp_path / "r.html", Facts(name="x", separation=made, command=""))
     text = (tmp_path / "r.html").read_text()
     assert ("lowered the cost" in text) == bool(said)

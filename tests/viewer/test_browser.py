@@ -73,7 +73,7 @@ def window(page):
     "options",
     [
         {},
-        {"channels": 1, "n_d": 1.0, "softness": 0.0, "haze": 0.0},
+        {"channels": 1, "n_d": 1.0, "softness": 0.0, "crest": 0.0},
         {"unit": 3000.0},
         {"unit": 1e-5, "channels": 1},
         {"size": 600, "channels": 1},
@@ -153,7 +153,7 @@ def test_highlight_fader_at_zero_removes_the_highlight_and_components_fade(page,
 
 
 def test_gloss_changes_the_lobe_as_the_formula_says(page, result, tmp_path):
-    separation = result(size=SIZE, haze=0.0)
+    separation = result(size=SIZE, crest=0.0)
     page.open(written(tmp_path / "page.html", separation), "zoom=1")
     direction = directions_inside(separation, 1, seed=8)[0]
     page.settle(x=direction[0].item(), y=direction[1].item(), ns=5.0)
