@@ -144,12 +144,12 @@ class FitSettings:
     lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
     lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)
     scattering_sd: float = setting(
-        0.06, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
+        0.03, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
     )
     robust: Literal["huber", "none"] = setting("huber", "loss that weighs cast shadows down")
-    lobe: Literal["auto", "ggx", "cosine", "single"] = setting(
+    lobe: Literal["auto", "ggx", "single"] = setting(
         "auto",
-        "GGX's or a power by the pictures, soft shadow edges where they pay; or the paper's formula alone",
+        "a cosine's power or GGX's, soft shadow edges where they pay; or the paper's formula alone",
     )
     max_iterations: int = setting(20, "limit of every joint solve", at_least=1)
     tolerance: float = setting(

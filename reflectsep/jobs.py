@@ -167,7 +167,7 @@ def wants_baseline(job: FitJob, capture: Capture) -> bool:
 def baseline_parts(job: FitJob, capture: Capture) -> list[Part]:
     """Parts of the fit of Lin & Lee's model."""
     counts = counts_before(capture)
-    without_s = fit_options(dataclasses.replace(job.fit, scattering="none", lobe="cosine"))
+    without_s = fit_options(dataclasses.replace(job.fit, scattering="none", lobe="single"))
     return [*reading(capture, counts, aligned=False, swept=False), *solving(counts, without_s, swept=False)]
 
 

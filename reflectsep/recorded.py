@@ -71,7 +71,7 @@ def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettin
         alignment=recorded_alignment(separation),
         progress=progress,
         scattering="none",
-        lobe="cosine",
+        lobe="single",
     )
 
 

@@ -16,6 +16,7 @@ from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.neighbours import MAD_TO_SD, smooth
 from reflectsep.fit.problem import (
+    GGX,
     Locals,
     Observations,
     Priors,
@@ -29,11 +30,12 @@ from reflectsep.fit.problem import (
 from reflectsep.solve.joint import inverse
 from reflectsep.solve.local import normal_equations
 
-SHAPE_SD = 0.1
-"""Scatter of log B about its geometric value before anything is known of it; 0.2 where the lights are unknown."""
-SHAPE_SD_LEAST, PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.005, 0.015, 0.01
-"""No prior is taken to be firmer than this: what lies below is the accuracy of the model itself. The shape's is small,
-for the lobe's peak goes with the power 2 n_s of B: a scatter of 0.005 is one of a third in the peak of n_s 30."""
+SHAPE_SD = ((0.1, 0.02), (0.03, 0.005))
+"""Scatter of log B about its geometric value: before anything is known of it (twice that where the lights are unknown),
+and at least. The lobe's peak goes with the power 2 n_s of B, so that 0.005 is a third of the peak at n_s 30. A power of
+a cosine, fitted to a rough surface, is off by more (first); the lobe of GGX is not (second)."""
+PARALLEL_SD_LEAST, RATIO_SD_LEAST = 0.015, 0.01
+"""No prior is taken to be firmer than this: what lies below is the accuracy of the model itself."""
 PARALLEL_SD_MOST = 0.06
 """Beyond this scatter the direction of s says nothing of that of d."""
 RATIO_SIGMA_PX = 3.0
@@ -43,8 +45,9 @@ RATIO_BREAK = 4.0
 """From about this many standard deviations off its neighbourhood on a pixel is of another material."""
 HEIGHT_FACTOR = 2.0
 """Peak of the lobe that is believed, over the largest value above the robust body, which takes some of it."""
-FACING_SD, FACING_SD_LEAST = 0.03, 0.01
-"""Scatter of the direction of d about that of d + s, in radians: at most, where it cannot be learnt, and at least."""
+FACING_SD = ((0.1, 0.03), (0.03, 0.01))
+"""Scatter of the direction of d about that of d + s, in radians: where it cannot be learnt, and at least; of a power
+and of GGX's lobe."""
 FACING_SIGMA_PX = 3.0
 """Over such a distance scattering mixes normals: where they turn within it, d + s says less of d."""
 RAYLEIGH = 1.18
@@ -104,14 +107,16 @@ def unknowns_in_effect(obs: Observations, priors: Priors, local: Tensor, shared:
     return float(trace.median()) / obs.channels
 
 
-def first_priors(obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float) -> Priors:
+def first_priors(
+    obs: Observations, body: Float[Tensor, "pixels channels 3"], sigma: float, shared: Float[Tensor, "G"]
+) -> Priors:
     """What can be expected before any lobe is fitted."""
     top = lambda cut: (obs.images[cut] - (body[cut] @ obs.alpha.mT).clamp_min(0.0)).mean(1).amax(-1)  # noqa: E731
     above = in_chunks(len(obs), top)
     highest = near_maximum(above)
     priors = replace(
         no_priors(len(obs), obs.images),
-        shape=1.0 / (SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD),
+        shape=1.0 / shape_scatter(obs, shared)[0],
         height=HEIGHT_FACTOR * max(highest, 5.0 * sigma),
     )
     power = in_chunks(len(obs), lambda cut: obs.s_basis[cut].square().sum((1, 2)))
@@ -218,9 +223,9 @@ def with_facing(
         return across(v, facing[cut]).norm(dim=-1) / v.norm(dim=-1).clamp_min(1e-9)
 
     seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
-    spread = FACING_SD
+    spread, least = FACING_SD[int(shared[GGX] > 0)]
     if int(seen.sum()) >= LEAST_SEEN:
-        spread = min(max(float(in_chunks(len(obs), off)[seen].median()) / RAYLEIGH, FACING_SD_LEAST), FACING_SD)
+        spread = min(max(float(in_chunks(len(obs), off)[seen].median()) / RAYLEIGH, least), spread)
     calm = smooth(facing, size, mask, FACING_SIGMA_PX)
 
     def weight(cut: slice) -> Tensor:
@@ -235,6 +240,12 @@ def with_facing(
     return replace(priors, facing=facing, facing_weight=in_chunks(len(obs), weight))
 
 
+def shape_scatter(obs: Observations, shared: Float[Tensor, "G"]) -> tuple[float, float]:
+    """`SHAPE_SD` of this lobe and these lights: at first, and at least."""
+    first, least = SHAPE_SD[int(shared[GGX] > 0)]
+    return (first if obs.lights_known else 2.0 * first), least
+
+
 def shape_spread(
     obs: Observations, local: Tensor, shared: Tensor, shine: Float[Tensor, "pixels lights"], sigma: float
 ) -> float:
@@ -246,9 +257,9 @@ def shape_spread(
 
     # Well seen: in two pictures or more, and well above the noise.
     seen = (shine > 2.0 * VISIBLE * sigma).sum(-1) >= 2
-    first = SHAPE_SD if obs.lights_known else 2.0 * SHAPE_SD
+    first, least = shape_scatter(obs, shared)
     if int(seen.sum()) < LEAST_SEEN:
         return first
     values = in_chunks(len(local), rows)[seen]
     spread = MAD_TO_SD * float((values - values.median()).abs().median())
-    return min(max(spread, SHAPE_SD_LEAST), first)
+    return min(max(spread, least), first)

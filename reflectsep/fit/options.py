@@ -12,7 +12,7 @@ class FitOptions:
     """All parameters together, or globals on chosen pixels first and then every pixel on its own (paper, section 5)."""
     scattering: Literal["measured", "none", "unknown"] = "measured"
     """s from the sweeps; left out (Lin & Lee); or fitted, seven unknowns a pixel (n >= 8)."""
-    scattering_sd: float = 0.06
+    scattering_sd: float = 0.03
     """Relative standard deviation of the measured s, beside the noise of its frames. d is what the small difference
     between the picture and s leaves, so an error of 3 % in s is one of 10 % in d, and of as much in the direction that
     d gives the lobe; s is fitted within this. 0 holds s as measured: the paper's four unknowns a pixel."""
@@ -30,9 +30,9 @@ class FitOptions:
     lambda_other: float = 2.0
     robust: Literal["huber", "none"] = "huber"
     """Loss of the pictures' residuals."""
-    lobe: Literal["auto", "ggx", "cosine", "single"] = "auto"
-    """The lobe of GGX microfacets or the paper's power of a cosine, whichever the pictures ask for, or one of them;
-    soft shadow edges where they pay. Or the paper's formula alone, the power with hard edges."""
+    lobe: Literal["auto", "ggx", "single"] = "auto"
+    """The paper's lobe, a power of a cosine, or that of GGX microfacets, and soft shadow edges where they pay; or the
+    paper's formula alone."""
     prior: Literal["auto", "none"] = "auto"
     """Priors of a strength taken from the data, or none but a bound on the lobe."""
     max_iterations: int = 20

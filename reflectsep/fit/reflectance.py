@@ -37,7 +37,6 @@ from reflectsep.fit.problem import (
     LOG_C_2,
     SOFTNESS,
     Observations,
-    Priors,
     no_priors,
     unpack,
 )
@@ -67,8 +66,6 @@ HUBER = 5.0
 MIN_PICTURES = {"measured": 6, "none": 6, "unknown": 8}
 N_D_SD, N_D_SD_LEAST = 0.05, 0.01
 """Relative standard deviation of n_d: of 1 where no sweep tells, and the least that a sweep's is taken to have."""
-LOBES = {"auto": (0.0, 1.0), "ggx": (1.0,), "cosine": (0.0,), "single": (0.0,)}
-"""Lobes to try, as `problem.GGX` has them; the pictures choose."""
 EXTENSION_GAIN = 0.01
 """Soft shadows stay only where they lower the whole cost by this share."""
 
@@ -186,7 +183,9 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     sigma = noise_of(obs.images, in_chunks(len(obs), rms), 3)
     body = robust_body(obs.images, alike(1.0 / sigma), obs.alpha, n_d)
     obs = replace(obs, s=beyond_the_edge(obs, body), weight=weights(obs, options, sigma))
-    priors = replace(first_priors(obs, body, sigma), log_n_d=math.log(n_d), n_d_sd=obs.n_d_sd)
+    shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)
+    shared[GGX] = float(options.lobe == "ggx")
+    priors = replace(first_priors(obs, body, sigma, shared), log_n_d=math.log(n_d), n_d_sd=obs.n_d_sd)
     if options.prior == "none":
         bare = no_priors(len(obs), obs.images)
         priors = replace(bare, height=priors.height, log_n_d=priors.log_n_d, n_d_sd=priors.n_d_sd)
@@ -195,7 +194,6 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     elif obs.s_unknown:
         priors = replace(priors, parallel=torch.zeros_like(priors.parallel))
         priors = replace(priors, ratio_weight=torch.zeros_like(priors.ratio_weight))
-    shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)
     free = torch.tensor([True, True, True, options.n_s is None, True, False, False, options.refine_n_d])
     if options.alpha_sd > 0:
         priors = replace(priors, alpha_sd=options.alpha_sd)
@@ -269,12 +267,8 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
     n_s = GRID_N_S if options.n_s is None else (options.n_s,)
     part, priors = obs.take(index), state.priors.take(index)
 
-    def best_of_grid(priors: Priors, ggx: float) -> list[Tensor]:
-        first = state.shared.clone()
-        first[GGX] = ggx
-        return globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
-
-    starts = [start for ggx in LOBES[options.lobe] for start in best_of_grid(priors, ggx)]
+    first = state.shared
+    starts = globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
     state = replace(state, shared=globals_from(state, starts))
     if options.prior == "auto":
         part, priors = state.obs.take(index), state.priors.take(index)
@@ -284,7 +278,7 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         spread = shape_spread(part.take(good), found.local[good], state.shared, shine, state.sigma)
         state = replace(state, priors=replace(state.priors, shape=1.0 / spread))
         # Under the firmer prior another start may lead lower.
-        again = best_of_grid(state.priors.take(index), float(state.shared[GGX]))
+        again = globals_grid(part, state.priors.take(index), first, n_s, trim=effort.trim, best=effort.starts)
         state = replace(state, shared=globals_from(state, [state.shared, *again]))
     progress("pixels", 0, 3)
     found = fit_locals(obs, state.priors, state.shared, effort, state.robust)

@@ -114,7 +114,7 @@ def test_only_pictures_are_robust(small_case):
 
 
 def test_lambda_of_equation_22_weighs_squared_residuals(small_case):
-    obs, *_ = at_truth(small_case)
+    obs, _, _, shared = at_truth(small_case)
     given = weights(obs, FitOptions(lambda_basis=1.0, lambda_other=2.0), 0.01)
     torch.testing.assert_close(given[0, 0].square() * 1e-4, double([1.0, 1, 1, 2, 2, 2]))
     assert (weights(obs, FitOptions(weights="noise"), 0.01) == 100.0).all()
@@ -138,7 +138,7 @@ def test_a_mirror_lobe_within_its_height_meets_the_shared_priors():
     shared = torch.zeros(8, dtype=torch.float64)
     shared[:3], shared[LOG_N_S], shared[LOG_C_2] = -0.9 * cosine, double(14.0).log(), double(1.8).log()
     assert float(shared_residual(shared, cosine, priors).abs().max()) < 1e-9
-    for index, shift in ((0, -0.05), (LOG_C_2, 0.1), (5, 0.1), (6, 0.1)):
+    for index, shift in ((0, -0.05), (LOG_C_2, 0.1), (SOFTNESS, 0.1)):
         moved = shared.clone()
         moved[index] += shift
         assert float(shared_residual(moved, cosine, priors).abs().max()) > 0.1
@@ -159,16 +159,16 @@ def test_the_noise_level_is_that_of_the_residuals():
 
 
 def test_the_first_priors_know_the_highest_highlight(small_case):
-    obs, *_ = at_truth(small_case)
+    obs, _, _, shared = at_truth(small_case)
     body = small_case.truth.d[..., small_case.stack.mask].permute(2, 1, 0) + obs.s_basis
     shine = small_case.specular[:, 0][:, small_case.stack.mask]
-    priors = first_priors(obs, body, 1e-3)
+    priors = first_priors(obs, body, 1e-3, shared)
     assert priors.height == pytest.approx(2 * float(shine.max()), rel=0.05)
-    assert first_priors(replace(obs, lights_known=False), body, 1e-3).shape == pytest.approx(priors.shape / 2)
+    assert first_priors(replace(obs, lights_known=False), body, 1e-3, shared).shape == pytest.approx(priors.shape / 2)
 
 
 def test_parallel_is_believed_as_far_as_it_holds(small_case):
-    obs, *_ = at_truth(small_case)
+    obs, _, _, shared = at_truth(small_case)
     assert parallel_spread(obs, 3 * obs.s_basis) < 1e-9
     crossed = obs.s_basis * double([1.5, 1.0, 0.7])
     assert parallel_spread(obs, crossed) > 0.06
