@@ -53,7 +53,7 @@ class Bench:
 
 
 def bracket(shift, degrees=0.0):
-    matrix = shifted(*shift, degrees, (31.5, 31.5))
+    matrix = shifted(shift[0], shift[1], degrees, (31.5, 31.5))
     still = torch.eye(3, dtype=torch.float64)
     streams = (Bench(exposure_s=SHORT_S, matrix=still), Bench(exposure_s=LONG_S, matrix=matrix))
     return BracketedStream(streams=streams, where="bench"), matrix
