@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from reflectsep.calibrate.align_options import AlignOptions
-from reflectsep.calibrate.alignment import Alignment, align, aligned_stream
+from reflectsep.calibrate.alignment import Alignment, align
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures, without
 from reflectsep.config import CalibrationSettings, FitSettings, ScatterSettings
@@ -209,7 +209,7 @@ def measure(
     for i, sweep in enumerate(capture.sweeps):
         if sweep.light in stack.names:
             stream = developed_stream(capture, open_sweep(capture, sweep), response)
-            streams.append(stream if alignment is None else aligned_stream(stream, alignment.sweeps[i]))
+            streams.append(stream if alignment is None else alignment.placed(i, stream))
     options = ScatterOptions(**dataclasses.asdict(scatter))
     return measure_scattering(stack, streams, options=options, progress=progress)
 

@@ -20,12 +20,13 @@ from torch import Tensor
 
 from reflectsep.calibrate.across_lights import across
 from reflectsep.calibrate.align_options import MARGIN_PX, AlignOptions, grown, judged
+from reflectsep.calibrate.aligned_stream import after, aligned_stream
+from reflectsep.calibrate.bracket_motion import bracket_motions
 from reflectsep.calibrate.motion import Motion, displacement, inside, positions, warp
 from reflectsep.calibrate.register import RegisterOptions, register
 from reflectsep.calibrate.sweep_sum import SweepSum, add_frames, roots_of
-from reflectsep.data import Capture, Frame, FrameStream, Sweep
+from reflectsep.data import Capture, FrameStream, Sweep
 from reflectsep.errors import CaptureError
-from reflectsep.io.ahead import frames_of
 from reflectsep.progress import Progress, silent
 from reflectsep.room import empty
 from reflectsep.solve.sharing import by_items
@@ -44,6 +45,8 @@ class Alignment:
     """In the capture's order; against the first basis picture, so that a frame is resampled once."""
     against_full: tuple[Motion, ...] = ()
     """The same sweeps against the full picture of their own light: what was measured."""
+    exposures: tuple[tuple[Motion, ...], ...] = ()
+    """Of each sweep: its bracket's further exposures against the first; none where it has one exposure."""
     warnings: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
     """(width, height) of the pictures."""
@@ -51,7 +54,21 @@ class Alignment:
     @property
     def moved(self) -> bool:
         """Whether any picture is resampled."""
-        return any(m.applied for m in (*self.pictures.values(), *self.sweeps))
+        return any(m.applied for m in (*self.pictures.values(), *self.of_frames()))
+
+    def of_frames(self) -> tuple[Motion, ...]:
+        """Of every sweep and every exposure, against the first basis picture."""
+        return (
+            *self.sweeps,
+            *(after(m, own) for m, each in zip(self.sweeps, self._exposures(), strict=True) for own in each),
+        )
+
+    def _exposures(self) -> tuple[tuple[Motion, ...], ...]:
+        return self.exposures or tuple(() for _ in self.sweeps)
+
+    def placed(self, i: int, stream: FrameStream) -> FrameStream:
+        """Developed frames of the capture's sweep `i` as the first basis picture has them."""
+        return aligned_stream(stream, self.sweeps[i], self._exposures()[i])
 
     def document(self, capture: Capture) -> dict[str, Any]:
         """As it stands in `separation.json`."""
@@ -62,7 +79,10 @@ class Alignment:
             "sweeps": [
                 {"light": sweep.light, "direction": sweep.direction, **motion.document()}
                 | {"against_full": measured.document()}
-                for sweep, motion, measured in zip(capture.sweeps, self.sweeps, self.against_full, strict=True)
+                | ({"exposures": [own.document() for own in exposures]} if exposures else {})
+                for sweep, motion, measured, exposures in zip(
+                    capture.sweeps, self.sweeps, self.against_full, self._exposures(), strict=True
+                )
             ],
         }
 
@@ -127,29 +147,31 @@ def align(
         found = by_items(len(names) - 1, between_lights)
         motions |= {name: Motion.from_plain(values) for name, values in zip(names[1:], found, strict=True)}
 
-    def same_light(i: int) -> tuple[dict[str, Any], list[str]]:
+    def same_light(i: int) -> tuple[dict[str, Any], list[dict[str, Any]], list[str]]:
         sweep = capture.sweeps[i]
         if sweep.light not in names:
-            return Motion(reason="its light has no full picture").plain(), []
+            return Motion(reason="its light has no full picture").plain(), [], []
         k = list(names).index(sweep.light)
-        added = add_frames(streams[i], options.n_d, progress)
+        exposures = bracket_motions(streams[i], mask, options)
+        added = add_frames(aligned_stream(streams[i], Motion(), exposures), options.n_d, progress)
         own = _same_light(grey[k], good[k], mask, motions[sweep.light], added, options)
         said = _too_long(sweep, added, mask)
         if own.reason.startswith("clipped"):
             said.append(f"sweep of {sweep.light} along {sweep.direction}: not registered, {own.reason}")
-        return own.plain(), said
+        return own.plain(), [motion.plain() for motion in exposures], said
 
     of_sweeps = by_items(len(capture.sweeps), same_light)
-    measured = [Motion.from_plain(own) for own, _ in of_sweeps]
+    measured = [Motion.from_plain(own) for own, _, _ in of_sweeps]
     sweeps = [
         _composed(own, motions[sweep.light], mask) if sweep.light in names else own
         for sweep, own in zip(capture.sweeps, measured, strict=True)
     ]
-    warnings = [text for _, said in of_sweeps for text in said]
+    warnings = [text for _, _, said in of_sweeps for text in said]
     return Alignment(
         pictures=motions,
         sweeps=tuple(sweeps),
         against_full=tuple(measured),
+        exposures=tuple(tuple(Motion.from_plain(m) for m in each) for _, each, _ in of_sweeps),
         warnings=tuple(warnings),
         size=(mask.shape[1], mask.shape[0]),
     )
@@ -214,41 +236,11 @@ def _composed(own: Motion, light: Motion, mask: Tensor) -> Motion:
 def covered(alignment: Alignment, height: int, width: int) -> Bool[Tensor, "height width"]:
     """Reference pixels that every picture and every frame has."""
     result = torch.ones((height, width), dtype=torch.bool)
-    for motion in (*alignment.pictures.values(), *alignment.sweeps):
+    for motion in (*alignment.pictures.values(), *alignment.of_frames()):
         if motion.applied:
             for time in (-1.0, 1.0):
                 result &= inside(positions(motion.at(time), height, width))
     return result
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignedStream:
-    """A stream of developed frames, each resampled once into the reference as it is read."""
-
-    stream: FrameStream
-    motion: Motion
-
-    @property
-    def sweep(self) -> Sweep:
-        """What is streamed."""
-        return self.stream.sweep
-
-    def __len__(self) -> int:
-        return len(self.stream)
-
-    def __iter__(self):
-        last = max(1, len(self.stream) - 1)
-        with frames_of(self.stream) as frames:
-            for frame in frames:
-                # Where nothing is clipped, nothing of that is resampled.
-                clipped = None if frame.saturated is None or not frame.saturated.any() else frame.saturated
-                values, saturated, _ = warp(frame.values, self.motion.at(2 * frame.index / last - 1), clipped)
-                yield Frame(index=frame.index, values=values, saturated=saturated)
-
-
-def aligned_stream(stream: FrameStream, motion: Motion) -> FrameStream:
-    """`stream` as the reference sees it; itself where nothing moved."""
-    return AlignedStream(stream=stream, motion=motion) if motion.applied else stream
 
 
 def _place_mask(mask: Tensor, place: Motion) -> Tensor:

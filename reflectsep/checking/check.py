@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from reflectsep.calibrate.align_options import AlignOptions
-from reflectsep.calibrate.alignment import Alignment, align, aligned_stream
+from reflectsep.calibrate.alignment import Alignment, align
 from reflectsep.calibrate.alpha import AlphaReport
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures
@@ -92,7 +92,7 @@ def _seen(
         capture, raw.names, pictures, saturated, mask, streams, options=AlignOptions(n_d=n_d), progress=progress
     )
     stack, lights = calibrate_stack(capture, minimum=3, alignment=alignment, condition_limit=math.inf)
-    still = [aligned_stream(stream, motion) for stream, motion in zip(streams, alignment.sweeps, strict=True)]
+    still = [alignment.placed(i, stream) for i, stream in enumerate(streams)]
     passages, gains, trouble = pass_over(stack, still, progress)
     return _Seen(alignment=alignment, stack=stack, lights=lights, passages=passages, gains=gains, trouble=trouble)
 

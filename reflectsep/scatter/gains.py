@@ -17,9 +17,12 @@ from reflectsep.scatter.local import box_sum
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage
 from reflectsep.scatter.width import lit_frames
+from reflectsep.scatter.width_fit import fitted_width
 
 MOST_SAMPLES = 20000
 FEWEST_SAMPLES = 24
+SAME_RATIO = 1.35
+"""Where C and the lit frames agree this well, exposures are equal and C, the more exact, is the slab's width."""
 HIGHLIGHT_RANK = 0.85
 """Pixels whose picture stands out from their median over the lights more than in this part of all are left out."""
 
@@ -90,9 +93,15 @@ def solve_gains(
     if usable:
         found = solve_exponent([s for s in of if s is not None], exponents(options))
     n_d, sd, source = _exponent(found, options, warnings)
+    of_eq_25 = {i: (found.gains[slot], found.gains_sd[slot]) for slot, i in enumerate(usable) if found is not None}
+    if options.lit_frames is None:
+        # Where C is not the width itself, it is worth the profiles' fit.
+        doubtful = [i for i, f in enumerate(frames) if i not in of_eq_25 or not same_ratio(of_eq_25[i][0], f)]
+        for i in doubtful:
+            frames[i] = _fitted(passages[i], stack.mask, frames[i])
     gains, gains_sd = list(frames), [0.1 * f for f in frames]
-    for slot, i in enumerate(usable):
-        gains[i], gains_sd[i] = found.gains[slot], found.gains_sd[slot]  # type: ignore[union-attr]
+    for i, (gain, gain_sd) in of_eq_25.items():
+        gains[i], gains_sd[i] = gain, gain_sd
     for i in set(range(len(of))) - set(usable):
         warnings.append(_geometry_warning(passages[i], frames[i], stack.mask))
     return Gains(
@@ -134,6 +143,17 @@ def _lit_frames(passage: Passage, mask: Tensor) -> float:
     guess = max(1.0, float(values[values < 2.0 * values.median()].median()))
     narrow = passage.narrow & mask
     return lit_frames(passage.kept, passage.centre, narrow, guess=guess, step_px=passage.step_px(mask)) or guess
+
+
+def _fitted(passage: Passage, mask: Tensor, counted: float) -> float:
+    """By the profiles, where they tell."""
+    narrow, step_px = passage.narrow & mask, passage.step_px(mask)
+    return fitted_width(passage.kept, passage.centre, narrow, guess=counted, step_px=step_px) or counted
+
+
+def same_ratio(gain: float, frames: float) -> bool:
+    """Whether C is the lit frames, so that the sweep's exposure is the pictures'."""
+    return 1 / SAME_RATIO < gain / frames < SAME_RATIO
 
 
 def _samples(stack: PhotometricStack, light: int, passage: Passage, chosen: Tensor) -> Samples | None:

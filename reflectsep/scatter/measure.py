@@ -26,7 +26,7 @@ from reflectsep.scatter.evidence import Evidence, Picture
 from reflectsep.scatter.exponent import complete
 from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
-from reflectsep.scatter.gains import Gains, choose_samples, exponents, solve_gains
+from reflectsep.scatter.gains import Gains, choose_samples, exponents, same_ratio, solve_gains
 from reflectsep.scatter.geometry import crude_normals, surface_stretch
 from reflectsep.scatter.kernel import Slab
 from reflectsep.scatter.local import box_sum, quantile
@@ -36,8 +36,6 @@ from reflectsep.scatter.passage import Passage, speed_deviation, watch
 LEAST_COVERAGE = 0.9
 DOUBTFUL = 0.6
 """A lit frame of a body that scatters all it does not reflect is about this part of what its light alone would give."""
-SAME_RATIO = 1.35
-"""Where C and the lit frames agree this well, exposures are equal and C, the more exact, is the slab's width."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +153,7 @@ def _prepare(
                 f"{LEAST_COVERAGE:.0%}: the sweep is shorter than the object"
             )
         lit_frames, gain = gains.lit_frames[i], gains.gains[i]
-        equal = options.lit_frames is None and 1 / SAME_RATIO < gain / lit_frames < SAME_RATIO
+        equal = options.lit_frames is None and same_ratio(gain, lit_frames)
         slab = _slab(gain if equal else lit_frames, steps_px[i])
         # Frame over full picture of a pixel that the slab lights alone.
         ratio = (gain / (2 * slab.half)) ** gains.n_d

@@ -9,7 +9,8 @@ from torch.nn.functional import avg_pool2d
 
 from reflectsep.calibrate import across_lights
 from reflectsep.calibrate.align_options import AlignOptions
-from reflectsep.calibrate.alignment import align, aligned_stream, covered
+from reflectsep.calibrate.aligned_stream import aligned_stream
+from reflectsep.calibrate.alignment import align, covered
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.motion import Motion, displacement, shifted
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures
