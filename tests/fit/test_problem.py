@@ -24,6 +24,7 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     LOG_C_2,
     LOG_N_S,
+    SOFTNESS,
     Locals,
     log_shape,
     no_priors,
@@ -114,7 +115,7 @@ def test_only_pictures_are_robust(small_case):
 
 
 def test_lambda_of_equation_22_weighs_squared_residuals(small_case):
-    obs, _, _, shared = at_truth(small_case)
+    obs, *_ = at_truth(small_case)
     given = weights(obs, FitOptions(lambda_basis=1.0, lambda_other=2.0), 0.01)
     torch.testing.assert_close(given[0, 0].square() * 1e-4, double([1.0, 1, 1, 2, 2, 2]))
     assert (weights(obs, FitOptions(weights="noise"), 0.01) == 100.0).all()
@@ -168,7 +169,7 @@ def test_the_first_priors_know_the_highest_highlight(small_case):
 
 
 def test_parallel_is_believed_as_far_as_it_holds(small_case):
-    obs, _, _, shared = at_truth(small_case)
+    obs, *_ = at_truth(small_case)
     assert parallel_spread(obs, 3 * obs.s_basis) < 1e-9
     crossed = obs.s_basis * double([1.5, 1.0, 0.7])
     assert parallel_spread(obs, crossed) > 0.06
