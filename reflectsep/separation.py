@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
 LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
+PEAK_FACTOR = 2.0
+"""The same factor on the brightest highlight seen is what a fit believes of the lobe's peak."""
 GREY, COLOUR = ("Y",), ("R", "G", "B")
 
 
@@ -66,6 +68,9 @@ class Separation:
     highlight_free: Float[Tensor, "3 channels height width"]
     """Picture minus specular: keeps what the model does not explain; the whole diffuse where the picture is clipped."""
     residual: Float[Tensor, "lights channels height width"]
+    ceiling: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(math.inf))
+    """Largest argument of the lobe when relighting: that of a highlight `PEAK_FACTOR` times the brightest that the fit
+    found in its own pictures. Where no picture saw the lobe, nothing else bounds it."""
     document: Mapping[str, Any]
     """What `separation.json` says beside the globals: settings, versions, timings, statistics."""
 
@@ -92,7 +97,7 @@ class Separation:
 
         Batched and differentiable in alpha. Where the light vectors are known, the length of the mixed vector is the
         light's intensity and scales the picture, so that `relight(2 * alpha) == 2 * relight(alpha)`; where they are
-        unknown, alpha enters Eq. 21 as it stands. Memory grows with the number of lights; loop over many.
+        unknown, alpha enters Eq. 21 as it stands. No lobe goes beyond `ceiling`. Memory grows with the number of lights; loop over many.
 
         Raises:
             ValueError: alpha does not end in three numbers, or is not finite.
@@ -105,7 +110,8 @@ class Separation:
         unit, intensity = self.unit_mix(alpha.reshape(-1, 3).to(self.d))
         d, s = self.d.permute(2, 3, 1, 0), self.s.permute(2, 3, 1, 0)
         B = self.B[0] if len(self.B) == 1 else self.B.mean(0)
-        pictures = reflectance(d, B, self.globals, s=s @ unit.mT, alpha=unit, width=edge_width(s, self.softness))
+        width = edge_width(s, self.softness)
+        pictures = reflectance(d, B, self.globals, s=s @ unit.mT, alpha=unit, width=width, ceiling=float(self.ceiling))
         pictures = pictures.permute(3, 2, 0, 1) * intensity[:, None, None, None] * self.mask
         return pictures.reshape(*lead, *pictures.shape[1:])
 
@@ -159,6 +165,7 @@ class Separation:
             if vectors is not None:
                 lights[name]["vector"] = vectors[i].tolist()
         shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "softness", "haze")}
+        shared |= {"ceiling": self.ceiling.tolist()} if bool(self.ceiling.isfinite()) else {}
         return {
             **self.document,
             "basis": list(self.basis),
@@ -219,7 +226,16 @@ def separate(
         residual=fit.residual,
         document=document,
     )
-    return with_components(separation, stack, measured)
+    return with_components(replace(separation, ceiling=lobe_ceiling(separation)), stack, measured)
+
+
+def lobe_ceiling(separation: Separation) -> Float[Tensor, ""]:
+    """`Separation.ceiling` from the lights of the fit, so that their own pictures stay as they are."""
+    unit, _ = separation.unit_mix(separation.alpha)
+    d, B = separation.d.permute(2, 3, 1, 0), separation.B.mean(0)
+    highest = [lobe_argument(d, B, separation.a, mix[None])[separation.mask].amax() for mix in unit]
+    u = torch.stack(highest).amax() if bool(separation.mask.any()) else separation.a.new_tensor(0.0)
+    return PEAK_FACTOR ** (1.0 / separation.n_s) * u.clamp_min(0.0)
 
 
 def with_components(separation: Separation, stack: PhotometricStack, measured: Tensor) -> Separation:
