@@ -77,7 +77,11 @@ def report(
     frames: Sequence[int] = (),
     progress: Progress,
 ) -> None:
-    """Write the report of a result; what its capture no longer tells is left out, and the report says why."""
+    """Write the report of a result; what its capture no longer tells is left out, and the report says why.
+
+    Raises:
+        ReflectsepError: `frames` are asked for by number and cannot be shown.
+    """
     stack: PhotometricStack | None = None
     views: tuple[SweepView, ...] = ()
     notes: list[str] = []
@@ -91,6 +95,8 @@ def report(
             progress("report", 1, 3)
             views = sweep_views(kept, stack, separation, frames)
         except ReflectsepError as error:
+            if frames:  # asked for by number: not to be left out
+                raise
             notes.append(f"Of the capture not all could be read again: {error}")
     progress("report", 2, 3)
     facts = Facts(

@@ -13,8 +13,8 @@ model it goes on below zero beyond the edge of an attached shadow, so there too 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -37,6 +37,8 @@ LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.e
 MAPS = (*COMPONENTS, "mask", "flags", "d", "s", "B", "d_sd", "s_sd", "B_sd", "residual")
 PIXELS_AT_ONCE = 1 << 18
 """Of which components are made."""
+PEAK_FACTOR = 2.0
+"""The same factor on the brightest highlight seen is what a fit believes of the lobe's peak."""
 GREY, COLOUR = ("Y",), ("R", "G", "B")
 
 
@@ -71,6 +73,9 @@ class Separation:
     highlight_free: Float[Tensor, "3 channels height width"]
     """Picture minus specular: keeps what the model does not explain; the whole diffuse where the picture is clipped."""
     residual: Float[Tensor, "lights channels height width"]
+    ceiling: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(math.inf))
+    """Largest argument of the lobe when relighting: that of a highlight `PEAK_FACTOR` times the brightest that the fit
+    found in its own pictures. Where no picture saw the lobe, nothing else bounds it."""
     document: Mapping[str, Any]
     """What `separation.json` says beside the globals: settings, versions, timings, statistics."""
 
@@ -97,7 +102,8 @@ class Separation:
 
         Batched and differentiable in alpha. Where the light vectors are known, the length of the mixed vector is the
         light's intensity and scales the picture, so that `relight(2 * alpha) == 2 * relight(alpha)`; where they are
-        unknown, alpha enters Eq. 21 as it stands. Memory grows with the number of lights; loop over many.
+        unknown, alpha enters Eq. 21 as it stands. No lobe goes beyond
+        `ceiling`. Memory grows with the number of lights; loop over many.
 
         Raises:
             ValueError: alpha does not end in three numbers, or is not finite.
@@ -110,7 +116,8 @@ class Separation:
         unit, intensity = self.unit_mix(alpha.reshape(-1, 3).to(self.d))
         d, s = self.d.permute(2, 3, 1, 0), self.s.permute(2, 3, 1, 0)
         B = self.B[0] if len(self.B) == 1 else self.B.mean(0)
-        pictures = reflectance(d, B, self.globals, s=s @ unit.mT, alpha=unit, width=edge_width(s, self.softness))
+        width = edge_width(s, self.softness)
+        pictures = reflectance(d, B, self.globals, s=s @ unit.mT, alpha=unit, width=width, ceiling=float(self.ceiling))
         pictures = pictures.permute(3, 2, 0, 1) * intensity[:, None, None, None] * self.mask
         return pictures.reshape(*lead, *pictures.shape[1:])
 
@@ -169,6 +176,7 @@ class Separation:
             if vectors is not None:
                 lights[name]["vector"] = vectors[i].tolist()
         shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "softness", "crest")}
+        shared |= {"ceiling": self.ceiling.tolist()} if bool(self.ceiling.isfinite()) else {}
         return {
             **self.document,
             "basis": list(self.basis),
@@ -233,16 +241,33 @@ def separate(
             return separation.s[:, :, rows]
         return scattering.root[:3, :, rows].float() / intensity_root
 
-    return with_components(separation, stack, measured)
+    return with_components(replace(separation, ceiling=lobe_ceiling(separation)), stack, measured)
+
+
+def lobe_ceiling(separation: Separation) -> Float[Tensor, ""]:
+    """`Separation.ceiling` from the lights of the fit, so that their own pictures stay as they are."""
+    unit, _ = separation.unit_mix(separation.alpha)
+    highest = separation.a.new_zeros(())
+    for rows in bands(separation.mask):
+        part = separation.rows(rows)
+        d, B = part.d.permute(2, 3, 1, 0)[part.mask], part.B.mean(0)[part.mask]
+        for mix in unit if len(d) else ():
+            highest = torch.maximum(highest, lobe_argument(d, B, part.a, mix[None]).amax())
+    return PEAK_FACTOR ** (1.0 / separation.n_s) * highest
+
+
+def bands(mask: Bool[Tensor, "height width"]) -> Iterator[slice]:
+    """Rows of a picture, about `PIXELS_AT_ONCE` at a time."""
+    height, width = mask.shape
+    band = max(1, PIXELS_AT_ONCE // width)
+    for top in range(0, height, band):
+        yield slice(top, min(top + band, height))
 
 
 def with_components(separation: Separation, stack: PhotometricStack, measured: Callable[[slice], Tensor]) -> Separation:
     """`separation` with its components filled in; `measured` gives rows of s_k as the sweeps had it."""
     found = {name: empty(*separation.d.shape, dtype=separation.d.dtype) for name in COMPONENTS}
-    height, width = separation.mask.shape
-    band = max(1, PIXELS_AT_ONCE // width)
-    for top in range(0, height, band):
-        band_rows = slice(top, min(top + band, height))
+    for band_rows in bands(separation.mask):
         for name, values in _components(separation, stack, measured(band_rows), band_rows).items():
             found[name][..., band_rows, :] = values
     return replace(separation, **found)

@@ -196,6 +196,27 @@ def test_batches_keep_their_shape_and_their_pictures(made, lead):
         torch.testing.assert_close(picture, expected)
 
 
+def test_a_lobe_that_no_picture_saw_goes_no_higher_than_twice_the_brightest_one_seen(tmp_path):
+    _, stack, _, fit = make_separation()
+    sharp = replace(fit, a=torch.tensor([-0.4, -0.4, -0.9]), n_s=torch.tensor(150.0), B=0.0 * fit.B + 1.5)
+    separation = separate(stack, None, replace(sharp, d=0.9 * torch.ones_like(fit.d) * stack.mask), {})
+    unit, _ = separation.unit_mix(separation.alpha)
+    u = torch.einsum("nk,khw->nhw", unit, separation.a[:, None, None] + separation.B[0] * separation.d[:, 0])
+    brightest = float((u[:, stack.mask].clamp_min(0.0).double() ** 150).max())
+    # The light along which a + B d points: as far from all of the fit's as it happens to be.
+    vectors = separation.light_vectors[:3]
+    peak = torch.linalg.solve(vectors / vectors.norm(dim=1, keepdim=True), torch.tensor([0.95, 0.95, 0.45]))
+    alpha = torch.linalg.solve(vectors.mT, peak / peak.norm())
+    dark = replace(separation, a=torch.full((3,), -100.0))  # without its lobe
+    shine = (separation.relight(alpha) - dark.relight(alpha))[0][stack.mask]
+    assert float(shine.max()) == pytest.approx(2 * brightest, rel=1e-3)
+    assert float(replace(separation, ceiling=torch.tensor(torch.inf)).relight(alpha).max()) > 100 * brightest
+    free = replace(separation, ceiling=torch.tensor(torch.inf))
+    assert torch.equal(free.relight(separation.alpha), separation.relight(separation.alpha))  # of the fit's own lights
+    separation.save(tmp_path / "result")
+    assert torch.equal(load(tmp_path / "result").relight(alpha), separation.relight(alpha))
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_relighting_is_differentiable_in_alpha(known):
     result, *_ = make_separation(channels=3, n_d=1.4, softness=0.2, crest=0.85, known=known)

@@ -61,7 +61,7 @@ def textures_of(separation: Separation, *, white: float) -> Textures:
     n_d = float(separation.n_d)
     albedo = positive_power((g * normal[:, None]).sum(0), n_d) * intensity / white
     w = separation.a.double()[:, None, None] + separation.B.mean(0).double() * separation.d.mean(1).double()
-    h = torch.einsum("ik,khw->ihw", solve, w).norm(dim=0)
+    h = torch.einsum("ik,khw->ihw", solve, w).norm(dim=0).clamp(max=float(separation.ceiling))
     n_s, crest = float(separation.n_s), separation.crest.double()
     whole = separation.diffuse.double().mean(0)
     share = separation.scattering.double().mean(0) / whole.clamp_min(1e-12)

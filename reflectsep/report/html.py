@@ -67,6 +67,17 @@ def _cells(row: Sequence[object], has_head: bool) -> list[tuple[str, object]]:
     return [("td" if has_head or i else "th", cell) for i, cell in enumerate(row)]
 
 
+def bars(head: str, of: str, rows: Iterable[tuple[str, float]]) -> str:
+    """A table of per cents with a bar behind each number, which a narrow screen shows as well."""
+    body = "".join(
+        f'<tr><td>{html.escape(words)}</td><td class="bar"><i style="width:{min(max(value, 0.0), 100.0):.4g}%"></i>'
+        f"{value:.1f} %</td></tr>"
+        for words, value in rows
+    )
+    top = f"<tr><th>{html.escape(head)}</th><th>{html.escape(of)}</th></tr>"
+    return f'<div class="scroll"><table>{top}{body}</table></div>'
+
+
 def picture(figure: Figure, caption: str, alternative: str = "") -> str:
     """A figure as a PNG inside the page, with its caption."""
     data = io.BytesIO()

@@ -8,9 +8,10 @@ import torch
 
 from reflectsep.flags import WORDS, Flag
 from reflectsep.report import html
-from reflectsep.report.charts import Panel, flag_bars, grid, upper_limit
+from reflectsep.report.charts import Panel, grid, upper_limit
 from reflectsep.report.html import UNIT, Section
 from reflectsep.separation import Separation
+from reflectsep.settings import shown
 
 
 def maps(separation: Separation) -> Section:
@@ -60,7 +61,7 @@ def maps(separation: Separation) -> Section:
                      "Orange and purple are pictures that are darker and brighter than the model."
                      " What has structure here is not in the model: cast shadows, inter-reflection, drift."),
         html.heading("Flags"),
-        html.picture(flag_bars(separation.flags, mask, WORDS), "Pixels of the object that carry each flag."),
+        flag_shares(separation),
     ]  # fmt: skip
     chosen = [f for f in Flag if f is not Flag.OUTSIDE_MASK and bool((separation.flags[mask] & int(f)).any())]
     flag_rows = [
@@ -77,6 +78,17 @@ def maps(separation: Separation) -> Section:
     return Section(key="maps", title="Residual, uncertainty, flags", body="".join(parts))
 
 
+def flag_shares(separation: Separation) -> str:
+    """Share of the object's pixels that carry each flag, as a table with bars; flags that none carries in one line."""
+    on_object = separation.flags[separation.mask]
+    named = [flag for flag in Flag if flag is not Flag.OUTSIDE_MASK]
+    share = {flag: 100 * float(((on_object & int(flag)) != 0).double().mean()) for flag in named}
+    bars = [(WORDS[str(flag.name)], value) for flag, value in share.items() if value > 0]
+    none = [WORDS[str(flag.name)] for flag, value in share.items() if value == 0]
+    table = html.bars("flag", "of the object's pixels", bars) if bars else ""
+    return table + html.text(f"On no pixel: {'; '.join(none)}." if none else "", "dim")
+
+
 def reproduce(separation: Separation, command: str) -> Section:
     """The command, timings, versions, settings."""
     document = separation.document
@@ -87,7 +99,7 @@ def reproduce(separation: Separation, command: str) -> Section:
     parts += [html.heading("Versions"), html.table([], [[k, v] for k, v in document.get("versions", {}).items()])]
     parts.append(html.heading("Settings"))
     for group, values in document.get("settings", {}).items():
-        parts.append(html.table([f"{group}.", ""], [[name, value] for name, value in values.items()]))
+        parts.append(html.table([f"{group}.", ""], [[name, shown(value)] for name, value in values.items()]))
     named = {
         "capture": document.get("capture", ""),
         "left out of the fit": ", ".join(document.get("heldout", [])) or "no light",

@@ -161,6 +161,7 @@ def description(shown: Shown, accuracy: Accuracy) -> dict[str, Any]:
         "lights": lights,
         "basis": None if vectors is None else vectors[:3].tolist(),
         "globals": {key: getattr(separation, key).tolist() for key in ("a", "n_s", "n_d", "softness", "crest")},
+        "ceiling": float(separation.ceiling) if bool(separation.ceiling.isfinite()) else None,
         "flag_counts": count(separation.flags),
         "flag_values": {str(flag.name): int(flag) for flag in Flag},
         "accuracy": {

@@ -153,7 +153,7 @@ def relit(separation: Separation, level: Level, alpha: Float[Tensor, "3"]) -> Fl
     d, s = level.d.permute(2, 3, 1, 0), level.s.permute(2, 3, 1, 0)
     shared = separation.globals
     body = diffuse((d + s) @ unit.mT, edge_width(s, shared.softness), shared.n_d)
-    shine = lobe(level.w.permute(1, 2, 0) @ unit.mT, shared.n_s, shared.crest)
+    shine = lobe((level.w.permute(1, 2, 0) @ unit.mT).clamp(max=float(separation.ceiling)), shared.n_s, shared.crest)
     return (body + shine[..., None, :])[..., 0].permute(2, 0, 1) * intensity * level.mask
 
 

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import re
 
 import pytest
 import torch
 
+from reflectsep import presentation
 from reflectsep.config import FitSettings
-from reflectsep.data import Frame, PhotometricStack, Sweep
+from reflectsep.data import Capture, Frame, PhotometricStack, Sweep
 from reflectsep.errors import SweepError
-from reflectsep.flags import Flag
+from reflectsep.flags import WORDS, Flag
 from reflectsep.presentation import command
+from reflectsep.progress import silent
+from reflectsep.report import charts
 from reflectsep.report.advice import ADVICE, GENERAL, what_to_do
+from reflectsep.report.charts import upper_limit
 from reflectsep.report.figures import HeldOut
+from reflectsep.report.quality import flag_shares, reproduce
 from reflectsep.report.sweeps import view_sweep
 from reflectsep.report.valley import cost_valley
 from reflectsep.report.writer import Facts, write_report
@@ -198,3 +204,48 @@ def test_the_model_of_lin_lee_is_not_set_beside_itself(exact, tmp_path):
     text = (tmp_path / "r.html").read_text()
     assert "has no other to stand beside it" in text
     assert "Local diffuse light left" not in text
+
+
+def test_frames_that_cannot_be_shown_are_an_error_and_nothing_is_written(exact, tmp_path, monkeypatch):
+    def lacking(*_):
+        raise SweepError("frames=999 to show: the sweep has 0 to 15")
+
+    separation, stack = exact
+    monkeypatch.setattr(presentation, "calibrate_stack", lambda *_, **__: (stack, None))
+    monkeypatch.setattr(presentation, "sweep_views", lacking)
+    capture = Capture(folder=tmp_path, object="x", lights={}, basis=separation.basis, images=())
+    out = tmp_path / "r.html"
+    with pytest.raises(SweepError, match="frames=999"):
+        presentation.report(out, separation, capture, result="x", frames=[999], progress=silent)
+    assert not out.exists()
+    presentation.report(out, separation, capture, result="x", progress=silent)
+    assert "frames=999 to show" in out.read_text()
+
+
+def test_flags_are_a_table_that_needs_no_width(exact):
+    separation, _ = exact
+    flags = torch.zeros_like(separation.flags)
+    on_object = separation.mask.nonzero()
+    for row, column in on_object[: len(on_object) // 4]:
+        flags[row, column] = int(Flag.SATURATED)
+    share = 100 * (len(on_object) // 4) / len(on_object)
+    said = flag_shares(dataclasses.replace(separation, flags=flags))
+    assert f'<i style="width:{share:.4g}%"></i>{share:.1f} %' in said
+    table, none = said.split("On no pixel")
+    assert WORDS["SATURATED"] in table
+    assert WORDS["SATURATED"] not in none
+    assert html.escape(WORDS["FAINT_LOBE"]) in none
+
+
+def test_settings_stand_as_they_are_typed(exact):
+    separation, _ = exact
+    document = {**separation.document, "settings": {"fit": {"n_s": None, "refine_n_d": False, "lobe": "auto"}}}
+    body = reproduce(dataclasses.replace(separation, document=document), "reflectsep fit").body
+    assert "<td>n_s</td><td>null</td>" in body
+    assert "<td>refine_n_d</td><td>false</td>" in body
+
+
+def test_the_limit_of_a_map_is_its_quantile_whatever_its_size(monkeypatch):
+    monkeypatch.setattr(charts, "QUANTILE_OF", 1000)
+    values = torch.linspace(0, 1, 50_001)
+    assert upper_limit(values)[1] == pytest.approx(0.99, abs=2e-3)

@@ -163,6 +163,18 @@ def test_gloss_changes_the_lobe_as_the_formula_says(page, result, tmp_path):
     assert share_within_one(middle(page.pixels()), expected)[0] >= 0.999
 
 
+def test_a_lobe_stops_at_the_ceiling_as_in_relight(page, result, tmp_path):
+    separation = dataclasses.replace(result(size=SIZE), ceiling=torch.tensor(0.6))
+    page.open(written(tmp_path / "page.html", separation), "zoom=1")
+    direction = directions_inside(separation, 1, seed=8)[0]
+    page.settle(x=direction[0].item(), y=direction[1].item())
+    white = white_point(separation.highlight_free + separation.specular, separation.mask)
+    alpha = mix_of(separation, direction, float(separation.intensity.mean()))
+    assert share_within_one(middle(page.pixels()), tone(separation.relight(alpha), white=white))[0] >= 0.999
+    free = dataclasses.replace(separation, ceiling=torch.tensor(torch.inf))
+    assert share_within_one(middle(page.pixels()), tone(free.relight(alpha), white=white))[0] < 0.999
+
+
 def test_dragging_moves_the_light_on_picture_and_hemisphere(page, colour_page):
     page.open(colour_page)
     left, top, width, height = page.box("#picture")

@@ -143,6 +143,7 @@ function set_pane(pane, about) {
   gl.uniform3fv(places.alpha, [...on[0].alpha, ...(on[1] || on[0]).alpha]);
   gl.uniform1fv(places.power, [on[0].power, (on[1] || on[0]).power]);
   gl.uniform4f(places.globals, state.ns || g.n_s, g.n_d, g.softness, g.crest);
+  gl.uniform1f(places.ceiling, about.ceiling ?? 1e30);
   gl.uniform1f(places.root_scale, about.scale[0]);
   gl.uniform1f(places.lobe_scale, about.scale[1]);
   // Faders scale light, and light is the n_d-th power of the roots.

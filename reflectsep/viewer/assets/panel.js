@@ -151,7 +151,7 @@ function value_of(result, pixel) {
   const g = PAGE.results[result].globals, n_s = state.ns || g.n_s;
   const power = (base, exponent) => base > 0 ? base ** exponent : 0;
   return pixel.d.map((d, c) => lights_on(result).reduce((sum, light) => {
-    const f_d = power(state.loc, 1 / g.n_d), f_s = power(state.scat, 1 / g.n_d), s = pixel.s[c], u = dot(pixel.w, light.alpha);
+    const f_d = power(state.loc, 1 / g.n_d), f_s = power(state.scat, 1 / g.n_d), s = pixel.s[c], u = Math.min(dot(pixel.w, light.alpha), PAGE.results[result].ceiling ?? 1e30);
     const root = dot(d.map((v, k) => f_d * v + f_s * s[k]), light.alpha), edge = f_s * g.softness * Math.max(0, (s[0] + s[1] + s[2]) / 3);
     const shine = lobe(u, n_s, g.crest);
     return sum + light.power * (state.spec * shine + power((root + Math.hypot(root, edge)) / 2, g.n_d));

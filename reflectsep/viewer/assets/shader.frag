@@ -6,6 +6,7 @@ uniform sampler2DArray measured;  // one layer a light, sRGB codes
 uniform vec3 alpha[2];            // of lights of unit intensity
 uniform float power[2];           // their intensities
 uniform vec4 globals;             // n_s, n_d, softness, crest
+uniform float ceiling;            // largest argument of the lobe
 uniform float root_scale;
 uniform float lobe_scale;         // of B
 uniform vec3 faders;              // of the specular, and of the roots of local diffuse and scattering
@@ -36,6 +37,7 @@ float soft_positive(float x, float e) { return 0.5 * (x + sqrt(x * x + e * e)); 
 
 // off-specular value of u = A (a + B d): Eq. 17, or the lobe of GGX microfacets where there is a crest
 float lobe(float u) {
+  u = min(u, ceiling);
   float n = globals.x, crest = globals.w;
   if (!(crest > 0.0)) return positive_power(u, n);
   if (!(u > 0.0)) return 0.0;
