@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,6 +14,8 @@ from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     ALPHA,
+    LOG_N_S,
+    MOST_LOG_N_S,
     SHARED_NAMES,
     mixing_of,
     pixel_residual,
@@ -31,6 +35,8 @@ from reflectsep.solve.sharing import by_chunks
 
 AMBIGUOUS_COST = 2.0
 """Two solutions whose costs differ by less are not told apart by the pictures."""
+AT_BOUND = 0.02
+"""Of log n_s."""
 OUTLIER = 5.0
 """Residual, in standard deviations, that marks a pixel."""
 
@@ -198,6 +204,12 @@ def warnings(state: State, options: FitOptions) -> tuple[str, ...]:
         said.append(
             f"only {seen} pixels show the highlight in two or more pictures: n_s, a and B rest on the prior; "
             "the specular component is not to be trusted"
+        )
+    if float(state.shared[LOG_N_S]) > MOST_LOG_N_S - AT_BOUND and bool(state.free[LOG_N_S]):
+        said.append(
+            f"n_s is at its bound of {math.exp(MOST_LOG_N_S):.0f}: what stands out does so in single pixels, as at the "
+            "edges of a print in pictures that do not lie alike; neither the specular component nor relighting is to "
+            "be trusted"
         )
     if state.joint is not None and not state.joint.converged:
         said.append(f"the joint fit stopped at its limit of {options.max_iterations} iterations")

@@ -8,7 +8,8 @@ import torch
 from reflectsep.errors import FitError
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
-from reflectsep.fit.problem import LOG_N_D, Locals, s_of_lights
+from reflectsep.fit.outcome import warnings
+from reflectsep.fit.problem import LOG_N_D, LOG_N_S, MOST_LOG_N_S, Locals, s_of_lights
 from reflectsep.fit.reflectance import fit_reflectance, observe, prepare, with_noise_of_fit
 from reflectsep.fit.solution import fit_locals
 from reflectsep.flags import Flag
@@ -74,6 +75,20 @@ def test_pixels_whose_scattering_is_no_number_are_left_out_and_flagged(small_cas
     assert not (without.flags & int(Flag.INVALID_INPUT)).any()
     with pytest.raises(FitError, match=r"scattering is not finite at any of the \d+ pixels"):
         fit_reflectance(small_case.stack, replace(broken, root=torch.full_like(root, torch.nan)), QUICK)
+
+
+def test_an_exponent_at_its_bound_is_warned_of(small_case):
+    obs, mask, _ = observe(small_case.stack, small_case.scattering, QUICK, torch.float64)
+    state = prepare(obs, mask, QUICK)
+    state = replace(state, found=fit_locals(state.obs, state.priors, state.shared, state.effort, state.robust))
+    sharp = state.shared.clone()
+    sharp[LOG_N_S] = MOST_LOG_N_S
+    said = lambda state: any("n_s is at its bound of 200" in text for text in warnings(state, QUICK))  # noqa: E731
+    assert said(replace(state, shared=sharp))
+    assert not said(state)
+    held = state.free.clone()
+    held[LOG_N_S] = False
+    assert not said(replace(state, shared=sharp, free=held))
 
 
 def test_costs_that_are_no_numbers_are_said(small_case):
