@@ -102,8 +102,8 @@ class Separation:
 
         Batched and differentiable in alpha. Where the light vectors are known, the length of the mixed vector is the
         light's intensity and scales the picture, so that `relight(2 * alpha) == 2 * relight(alpha)`; where they are
-        unknown, alpha enters Eq. 21 as it stands. No lobe goes beyond
-        `ceiling`. Memory grows with the number of lights; loop over many.
+        unknown, alpha enters Eq. 21 as it stands. No lobe goes beyond `ceiling`. Memory grows with the
+        number of lights; loop over many.
 
         Raises:
             ValueError: alpha does not end in three numbers, or is not finite.

@@ -71,7 +71,8 @@ def complain(error: Exception, where: str = "") -> int:
         return FAILED
     if isinstance(error, SettingsError) and os.environ.get("RANK", "0") != "0":
         return USAGE  # the processes of a shared run have the same settings; the first says it
-    text = " ".join(str(error).split())
+    said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else str(error)
+    text = " ".join(said.split())
     print(f"reflectsep: error: {where}{text}", file=sys.stderr, flush=True)
     return USAGE if isinstance(error, SettingsError) else FAILED
 

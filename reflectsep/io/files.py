@@ -30,7 +30,10 @@ def atomic_write(path: Path | str, write: Callable[[Path], object]) -> None:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}.", suffix=f".part{path.suffix}", dir=path.parent)
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}.", suffix=f".part{path.suffix}", dir=path.parent)
+    except OSError as error:
+        raise _about(error, path) from None
     os.close(handle)
     temporary = Path(name)
     try:
@@ -39,8 +42,10 @@ def atomic_write(path: Path | str, write: Callable[[Path], object]) -> None:
         temporary.chmod(0o666 & ~_umask())
         _sync(temporary)
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise _about(error, path) from error
         raise
     _sync_folder(path.parent)
 
@@ -62,7 +67,10 @@ def atomic_folder(out: Path | str, overwrite: bool) -> Iterator[Path]:
     out = Path(os.path.abspath(out))
     _may_replace(out, overwrite)
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{out.name[:40]}.", suffix=".part", dir=out.parent))
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name[:40]}.", suffix=".part", dir=out.parent))
+    except OSError as error:
+        raise _about(error, out) from None
     try:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
@@ -71,10 +79,22 @@ def atomic_folder(out: Path | str, overwrite: bool) -> Iterator[Path]:
                 _sync(file)
         _may_replace(out, overwrite)
         _exchange(temporary, out)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise _about(error, out, temporary) from error
         raise
     _sync_folder(out.parent)
+
+
+def _about(error: OSError, path: Path, temporary: Path | None = None) -> OSError:
+    """The same error about the file that was to be made, not about the temporary one in its place."""
+    named = Path(error.filename) if isinstance(error.filename, str) else None
+    if error.errno is None or (temporary is not None and named is not None and not named.is_relative_to(temporary)):
+        return error
+    if temporary is not None and named is not None:
+        path = path / named.relative_to(temporary)
+    return OSError(error.errno, error.strerror, str(path))
 
 
 def inside(folder: Path | str, relative: str) -> Path:
@@ -177,15 +197,23 @@ def _may_replace(out: Path, overwrite: bool) -> None:
 
 
 def refuse_existing(path: Path | str, overwrite: bool) -> None:
-    """Refuse an output that is already there before any work is done for it; an empty folder is free.
+    """Refuse an output before any work is done for it: one that is there, or that can never be written.
+
+    An empty folder is free.
 
     Raises:
-        ResultError: `path` exists and `overwrite` is false.
+        ResultError: `path` exists and `overwrite` is false, or its folder is none or takes no files.
     """
     path = Path(path)
     empty = path.is_dir() and not path.is_symlink() and not any(path.iterdir())
     if os.path.lexists(path) and not empty and not overwrite:
         raise ResultError(f"{path}: exists; choose another place, or say overwrite=true")
+    whole = Path(os.path.abspath(path))
+    above = next((folder for folder in whole.parents if os.path.lexists(folder)), whole)
+    if not above.is_dir():
+        raise ResultError(f"{path}: cannot be written: {above} is not a folder")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise ResultError(f"{path}: cannot be written: nothing may be written in {above}")
 
 
 def refuse_folder(path: Path | str, overwrite: bool) -> None:

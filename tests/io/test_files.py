@@ -1,11 +1,23 @@
+import errno
 import json
+import os
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from reflectsep.errors import CaptureError, ResultError
-from reflectsep.io.files import atomic_folder, atomic_write, inside, read_json, sha256, write_json
+from reflectsep.io.files import (
+    atomic_folder,
+    atomic_write,
+    inside,
+    read_json,
+    refuse_existing,
+    refuse_folder,
+    sha256,
+    write_json,
+)
 
 
 def names(folder):
@@ -207,3 +219,28 @@ def test_old_folder_comes_back_when_the_new_one_cannot_be_moved(tmp_path, monkey
         pass
     assert (out / "capture.json").read_text() == "old"
     assert names(tmp_path) == ["out"]
+
+
+def test_an_error_of_the_disk_names_what_was_to_be_written(tmp_path):
+    def full(temporary):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(OSError, match="No space left") as caught:
+        atomic_write(tmp_path / "page.html", full)
+    assert caught.value.filename == str(tmp_path / "page.html")
+    with pytest.raises(OSError, match="No space left") as caught, atomic_folder(tmp_path / "out", False) as folder:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder / "L1.exr"))
+    assert caught.value.filename == str(tmp_path / "out/L1.exr")
+    with pytest.raises(FileNotFoundError) as caught, atomic_folder(tmp_path / "out", False):
+        (tmp_path / "elsewhere").read_text()
+    assert caught.value.filename == str(tmp_path / "elsewhere")
+
+
+def test_an_output_that_can_never_be_written_is_refused_at_once(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ResultError, match=r"file/x/y: cannot be written: .*file is not a folder"):
+        refuse_folder(tmp_path / "file/x/y", False)
+    refuse_folder(tmp_path / "new/deep/folder", False)
+    monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path)
+    with pytest.raises(ResultError, match=r"new/x\.png: cannot be written: nothing may be written in"):
+        refuse_existing(tmp_path / "new/x.png", False)
