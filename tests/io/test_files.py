@@ -242,5 +242,5 @@ def test_an_output_that_can_never_be_written_is_refused_at_once(tmp_path, monkey
         refuse_folder(tmp_path / "file/x/y", False)
     refuse_folder(tmp_path / "new/deep/folder", False)
     monkeypatch.setattr(os, "access", lambda path, _: Path(path) != tmp_path)
-    with pytest.raises(ResultError, match="new/x.png: cannot be written: nothing may be written in"):
+    with pytest.raises(ResultError, match=r"new/x\.png: cannot be written: nothing may be written in"):
         refuse_existing(tmp_path / "new/x.png", False)
