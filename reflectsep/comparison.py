@@ -50,9 +50,8 @@ def compare_result(
         model = {"Lin & Lee": light.baseline}
         methods = model if baseline is ours else {"ours": light.ours} | model
         scores = [f"{name} {psnr(p, light.real, mask):5.1f} dB" for name, p in (methods | dict(light.others)).items()]
-        lines.append(
-            f"  {light.light:12s} {', '.join(scores)}{''.join(f'; {words}' for words in (light.place, light.note) if words)}"
-        )
+        said = "".join(f"; {words}" for words in (light.place, light.note) if words)
+        lines.append(f"  {light.light:12s} {', '.join(scores)}{said}")
     return "\n".join([*lines, *truth_lines(ours, baseline, capture)])
 
 

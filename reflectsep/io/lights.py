@@ -162,7 +162,7 @@ def _own_light(path: Path, name: str, entry: Any) -> Light:
     given = entry.get("intensity", 1.0)
     given = given if isinstance(given, list) else [given]
     strength = _json_numbers(given, f"{where}: intensity", (1, 3), text=False)
-    return Light(name=name, direction=direction, intensity=_intensity(strength, where))
+    return Light(name=name, direction=direction, intensity=_intensity(strength, f"{where}: intensity"))
 
 
 def _alicevision(path: Path, entries: list[Any]) -> dict[str, Light]:
