@@ -22,6 +22,9 @@ from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
 from reflectsep.report.metrics import psnr, relative_rms
 from reflectsep.separation import Separation
 
+WEAK = 150.0
+"""Condition number of a polynomial's terms from which the noise of the pictures is most of what it relights."""
+
 
 def compare_result(
     ours: Separation,
@@ -52,7 +55,19 @@ def compare_result(
         scores = [f"{name} {psnr(p, light.real, mask):5.1f} dB" for name, p in (methods | dict(light.others)).items()]
         said = "".join(f"; {words}" for words in (light.place, light.note) if words)
         lines.append(f"  {light.light:12s} {', '.join(scores)}{said}")
-    return "\n".join([*lines, *truth_lines(ours, baseline, capture)])
+    return "\n".join([*lines, *weak_polynomial(ours), *truth_lines(ours, baseline, capture)])
+
+
+def weak_polynomial(ours: Separation) -> list[str]:
+    """A line where the lights of the fit hardly tell the polynomial's terms apart, so that its figures mean little."""
+    if ours.light_vectors is None:
+        return []
+    known = ptm_terms(ours.light_vectors / ours.light_vectors.norm(dim=-1, keepdim=True))
+    condition = float(torch.linalg.cond(known.double()))
+    if len(known) < known.shape[1] or condition <= WEAK:
+        return []
+    words = f"the {len(known)} lights hardly tell its {known.shape[1]} terms apart (condition number {condition:.0f})"
+    return [f"  PTM          not a fair figure: {words}"]
 
 
 def component_row(ours: Separation, baseline: Separation, i: int) -> ComparisonRow:
