@@ -17,10 +17,13 @@ from reflectsep.export.harmonics import ptm_terms
 from reflectsep.io.exr import read_channels
 from reflectsep.io.lights import read_lights
 from reflectsep.io.pictures import read_picture
-from reflectsep.relight import LightMix, alphas_for
+from reflectsep.relight import LightMix, alphas_for, place_of
 from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
 from reflectsep.report.metrics import psnr, relative_rms
 from reflectsep.separation import Separation
+
+WEAK = 150.0
+"""Condition number of a polynomial's terms from which the noise of the pictures is most of what it relights."""
 
 
 def compare_result(
@@ -39,15 +42,32 @@ def compare_result(
     """
     rows = [component_row(ours, baseline, i) for i in range(3)]
     relit = left_out(ours, baseline, capture, pictures) + beside(ours, baseline, capture, still)
-    write_comparison(out, rows, relit, mask=ours.mask, title=str(ours.document.get("object", "")))
+    name = str(ours.document.get("object", ""))
+    if baseline is ours:
+        write_comparison(out, rows, relit, mask=ours.mask, title=f"{name}: Lin & Lee's model", baseline="")
+    else:
+        write_comparison(out, rows, relit, mask=ours.mask, title=name)
     lines = [str(out)]
     for light in relit:
         mask = ours.mask if light.counts is None else ours.mask & light.counts
         model = {"Lin & Lee": light.baseline}
         methods = model if baseline is ours else {"ours": light.ours} | model
         scores = [f"{name} {psnr(p, light.real, mask):5.1f} dB" for name, p in (methods | dict(light.others)).items()]
-        lines.append(f"  {light.light:12s} {', '.join(scores)}{light.note and '; ' + light.note}")
-    return "\n".join([*lines, *truth_lines(ours, baseline, capture)])
+        said = "".join(f"; {words}" for words in (light.place, light.note) if words)
+        lines.append(f"  {light.light:12s} {', '.join(scores)}{said}")
+    return "\n".join([*lines, *weak_polynomial(ours), *truth_lines(ours, baseline, capture)])
+
+
+def weak_polynomial(ours: Separation) -> list[str]:
+    """A line where the lights of the fit hardly tell the polynomial's terms apart, so that its figures mean little."""
+    if ours.light_vectors is None:
+        return []
+    known = ptm_terms(ours.light_vectors / ours.light_vectors.norm(dim=-1, keepdim=True))
+    condition = float(torch.linalg.cond(known.double()))
+    if len(known) < known.shape[1] or condition <= WEAK:
+        return []
+    words = f"the {len(known)} lights hardly tell its {known.shape[1]} terms apart (condition number {condition:.0f})"
+    return [f"  PTM          not a fair figure: {words}"]
 
 
 def component_row(ours: Separation, baseline: Separation, i: int) -> ComparisonRow:
@@ -116,6 +136,7 @@ def held_out(
         ours=bounded(ours.relight(alpha), real),
         baseline=bounded(baseline.relight(alpha), real),
         counts=counts,
+        place="" if ours.light_vectors is None else place_of(mix.alpha, ours.light_vectors, ours.view),
         others={name: bounded(picture, real) for name, picture in plain.items()},
     )
 

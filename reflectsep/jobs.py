@@ -41,7 +41,7 @@ from reflectsep.io.lights import read_lights
 from reflectsep.pipeline import counts_before, fit, fit_options, with_calibration
 from reflectsep.progress import Journal, Progress, Titled, silent, titled
 from reflectsep.recorded import held_out_rows, lin_lee_beside, real_pictures, recorded_capture, recorded_settings
-from reflectsep.relight import LightMix, alphas_for, orbit, relight_to_folder
+from reflectsep.relight import LightMix, alphas_for, orbit, outside_basis, relight_to_folder
 from reflectsep.report.sheet import motion_plot
 from reflectsep.report.tone import tone, white_point
 from reflectsep.room import room_beside
@@ -186,8 +186,11 @@ def run_relight(job: RelightJob, progress: Progress = silent) -> str:
     separation = load(job.result)
     if job.format != "exr":
         return presentation.screen_pictures(job, separation, mixes(job, separation), progress)
-    files = relight_to_folder(separation, mixes(job, separation), job.out, overwrite=job.overwrite, progress=progress)
-    return f"{job.out}: {len(files)} picture{'s' if len(files) > 1 else ''}"
+    lights = mixes(job, separation)
+    files = relight_to_folder(separation, lights, job.out, overwrite=job.overwrite, progress=progress)
+    far = sum(outside_basis(mix.alpha) for mix in lights.values())
+    said = f"; {far} of them extrapolated: light outside the basis lights" if far else ""
+    return f"{job.out}: {len(files)} picture{'s' if len(files) > 1 else ''}{said}"
 
 
 def mixes(job: RelightJob, separation: Separation) -> Mapping[str, LightMix]:

@@ -71,7 +71,10 @@ def fit(
 
     Raises:
         ReflectsepError: whatever makes the capture unfit, in one line that names the file.
+        TypeError: a path in place of a capture.
     """
+    if not isinstance(capture, Capture):
+        raise TypeError(f"fit takes a capture, got {capture!r:.80}: reflectsep.fit(reflectsep.load_capture(FOLDER))")
     settings, scatter = changed(settings or FitSettings(), changes), scatter or ScatterSettings()
     with naming(capture.folder):
         return separated(

@@ -80,6 +80,19 @@ def alphas_for(lights: Sequence[Light], basis: Float[Tensor, "lights 3"] | None)
     return mixes
 
 
+def outside_basis(alpha: Sequence[float]) -> bool:
+    """Whether a light lies outside the triangle of the basis lights: its picture is extrapolated, not interpolated."""
+    return min(alpha) < -1e-4 * max(map(abs, alpha))
+
+
+def place_of(alpha: Sequence[float], basis: Float[Tensor, "lights 3"], view: Float[Tensor, "3"]) -> str:
+    """Where a light stands, in words: its angle off the view, and whether it lies between the basis lights."""
+    vector = torch.tensor(tuple(alpha), dtype=torch.float64) @ basis[:3].double()
+    size = float(vector.norm() * view.double().norm())
+    angle_deg = math.degrees(math.acos(min(1.0, max(-1.0, float(vector @ view.double()) / max(size, 1e-30)))))
+    return f"{angle_deg:.0f}° off the view, {'outside' if outside_basis(alpha) else 'between'} the basis lights"
+
+
 def orbit(count: int, elevation_deg: float, *, start_deg: float = 0.0, intensity: float = 1.0) -> tuple[Light, ...]:
     """Lights on a circle round the view axis, counter-clockwise from x, named `orbit_0000` and so on.
 

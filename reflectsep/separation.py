@@ -108,6 +108,7 @@ class Separation:
         Raises:
             ValueError: alpha does not end in three numbers, or is not finite.
         """
+        alpha = torch.as_tensor(alpha)  # a list or an array will do
         if alpha.shape[-1:] != (3,):
             raise ValueError(f"alpha has shape {tuple(alpha.shape)}, expected (..., 3)")
         if not bool(alpha.isfinite().all()):

@@ -8,7 +8,7 @@ import torch
 
 from reflectsep.calibrate.heldout import HeldOutPictures
 from reflectsep.calibrate.motion import Motion
-from reflectsep.comparison import left_out, without_a_lobe
+from reflectsep.comparison import left_out, weak_polynomial, without_a_lobe
 from reflectsep.data import Light
 
 
@@ -50,6 +50,18 @@ def test_nothing_is_fitted_to_unknown_lights_nor_a_polynomial_to_too_few(result)
     few = result(size=8)
     few = dataclasses.replace(few, alpha=few.alpha[:5], light_vectors=few.light_vectors[:5], residual=few.residual[:5])
     assert set(without_a_lobe(few, alpha)) == {"Lambert"}
+
+
+def test_a_polynomial_that_the_lights_do_not_determine_is_no_fair_figure(result):
+    separation = result(size=8)
+    turn = torch.arange(6) * torch.pi / 3 + 0.1
+    ring = torch.stack([0.4 * turn.cos(), 0.4 * turn.sin(), torch.full((6,), 0.84).sqrt()], 1)
+    ring[3:, :2] *= 1.01
+    (line,) = weak_polynomial(dataclasses.replace(separation, light_vectors=ring))
+    assert "PTM          not a fair figure: the 6 lights hardly tell its 6 terms apart" in line
+    spread = torch.tensor([[0, 0, 1], [0.6, 0, 0.8], [0, 0.6, 0.8], [-0.6, 0, 0.8], [0, -0.6, 0.8], [0.6, 0.6, 0.53]])
+    assert weak_polynomial(dataclasses.replace(separation, light_vectors=spread)) == []
+    assert weak_polynomial(result(size=8, known=False)) == []
 
 
 def test_a_held_out_picture_says_that_it_was_moved_and_leaves_out_what_is_clipped(result):

@@ -366,3 +366,8 @@ def test_demo_leaves_a_figure_and_relit_pictures(tmp_path):
     assert len(list((out / "relit").glob("*.exr"))) == 3
     assert (out / "result" / "report.html").is_file()
     assert (out / "result" / "view.html").is_file()
+
+
+def test_a_path_in_place_of_a_capture_is_told_what_to_do():
+    with pytest.raises(TypeError, match=r"got 'captures/wax': reflectsep\.fit\(reflectsep\.load_capture\(FOLDER\)\)"):
+        pipeline.fit("captures/wax")

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 from reflectsep.data import Light
 from reflectsep.errors import LightError, ResultError
 from reflectsep.io.exr import read_channels
-from reflectsep.relight import MARKER, LightMix, alphas_for, orbit, relight_to_folder, safe_name
+from reflectsep.relight import (
+    MARKER,
+    LightMix,
+    alphas_for,
+    orbit,
+    outside_basis,
+    place_of,
+    relight_to_folder,
+    safe_name,
+)
 
 BASIS = torch.tensor([[0.0, 0.5, 0.9], [-0.5, -0.3, 0.8], [0.5, -0.3, 0.8]])
 
@@ -180,3 +189,19 @@ def test_bad_requests_write_nothing(tmp_path, lights, message):
     with pytest.raises(LightError, match=message):
         relight_to_folder(Ramp(), lights, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("direction", "words"),
+    [
+        ((0.0, 0.0, 1.0), "0° off the view, between the basis lights"),
+        ((math.sin(math.radians(60)), 0.0, 0.5), "60° off the view, outside the basis lights"),
+        ((0.0, 0.0, -1.0), "180° off the view, outside the basis lights"),
+    ],
+)
+def test_a_light_is_said_to_be_between_the_basis_lights_or_outside(direction, words):
+    up = math.sqrt(0.75)
+    basis = torch.tensor([[0.5, 0.0, up], [-0.25, 0.433, up], [-0.25, -0.433, up]])
+    alpha = alphas_for([Light(name="A", direction=direction, intensity=(1.0,))], basis)["A"].alpha
+    assert place_of(alpha, basis, torch.tensor([0.0, 0.0, 1.0])) == words
+    assert not outside_basis((1.0, 0.0, 0.0))

@@ -196,6 +196,13 @@ def test_batches_keep_their_shape_and_their_pictures(made, lead):
         torch.testing.assert_close(picture, expected)
 
 
+def test_alpha_may_be_a_list_or_an_array(made):
+    result, *_ = made
+    expected = result.relight(torch.tensor([0.3, 0.5, 0.4]))
+    assert torch.equal(result.relight([0.3, 0.5, 0.4]), expected)
+    assert torch.equal(result.relight(np.array([0.3, 0.5, 0.4], dtype=np.float32)), expected)
+
+
 def test_a_lobe_that_no_picture_saw_goes_no_higher_than_twice_the_brightest_one_seen(tmp_path):
     _, stack, _, fit = make_separation()
     sharp = replace(fit, a=torch.tensor([-0.4, -0.4, -0.9]), n_s=torch.tensor(150.0), B=0.0 * fit.B + 1.5)

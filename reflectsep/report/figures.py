@@ -70,6 +70,8 @@ class HeldOut:
     """The same light by other methods, by name."""
     note: str = ""
     """What was done to the real picture."""
+    place: str = ""
+    """Where the light stands, in words."""
 
 
 def write_comparison(
@@ -106,7 +108,8 @@ def comparison_figure(
         held_out: one a light to compare the relit pictures of.
         mask: the object; numbers are over it, and the pictures are cut to it.
         title: above everything.
-        baseline: name of what ours is compared with.
+        baseline: name of what ours is compared with; empty where ours has no scattering and is Lin & Lee's model
+            itself: then nothing stands beside it.
 
     Raises:
         ValueError: nothing to show, an empty mask, or values on the object that are not finite.
@@ -198,6 +201,8 @@ def _draw_components(
         (f"(e) diffuse, {baseline}", row.baseline_diffuse, "diffuse", row.true_diffuse),
         (f"(f) specular, {baseline}", row.baseline_specular, "specular", row.true_specular),
     )
+    if not baseline:
+        panels = (panels[0], ("(b) diffuse", *panels[2][1:]), ("(c) specular", *panels[3][1:]))
     whole = row.original[:, mask].double().sum()
     for column, (title, picture, kind, truth) in enumerate(panels):
         gain = gains.get(kind, 1)
@@ -214,22 +219,29 @@ def _draw_held_out(
     page: _Page, index: int, light: HeldOut, mask: Tensor, white: float, limit: float, baseline: str
 ) -> None:
     """The row of Figs. 5 and 7, with the scale of the differences at its end."""
-    page.row_head(index, f"Held-out light {light.light}")
+    page.row_head(index, f"Held-out light {light.light}" + (f", {light.place}" if light.place else ""))
     counts = mask if light.counts is None else mask & light.counts.cpu()
     norm = Normalize(-100 * limit / white, 100 * limit / white)
     colours = ScalarMappable(norm=norm, cmap=DIVERGING)
     page.panel(index, 0, tone(light.real, white=white), "(a) real", "")
-    for column, name, picture in ((1, "ours", light.ours), (3, baseline, light.baseline)):
+    both = ((1, "ours", light.ours), (3, baseline, light.baseline))
+    for column, name, picture in both if baseline else ((1, "", light.ours),):
         error = 100 * relative_rms(picture, light.real, counts)
         numbers = f"PSNR {psnr(picture, light.real, counts):.1f} dB\nRMS error {error:.1f} % of real"
-        page.panel(index, column, tone(picture, white=white), f"({'abcd'[column]}) synthetic, {name}", numbers)
+        page.panel(
+            index, column, tone(picture, white=white), f"({'abcd'[column]}) synthetic{name and f', {name}'}", numbers
+        )
         difference = torch.where(mask, (light.real - picture).mean(0).cpu(), 0.0) * (100 / white)
         pixels = colours.to_rgba(difference.double().numpy(), bytes=True)[..., :3]
         worst = float(difference.abs().max())
         page.panel(
-            index, column + 1, pixels, f"({'abcde'[column + 1]}) real − {name}", f"largest {worst:.1f} % of white"
+            index,
+            column + 1,
+            pixels,
+            f"({'abcde'[column + 1]}) real − {name or 'synthetic'}",
+            f"largest {worst:.1f} % of white",
         )
-    bar = page.figure.colorbar(colours, cax=page.axes(index, 5, 0.16), extend="both")
+    bar = page.figure.colorbar(colours, cax=page.axes(index, 5 if baseline else 3, 0.16), extend="both")
     bar.set_label("real − synthetic, % of white", fontsize=9)
     bar.ax.tick_params(labelsize=9)
 

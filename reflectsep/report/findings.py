@@ -150,7 +150,7 @@ def held_out(separation: Separation, lights: Sequence[HeldOut], baseline: bool) 
                     diverging=True,
                 )
             )
-            numbers.append([light.light, named[model], f"{score:.1f} dB", f"{error:.1f} %"])
+            numbers.append([light.light, light.place, named[model], f"{score:.1f} dB", f"{error:.1f} %"])
         rows.append(row)
     return Section(
         key="heldout",
@@ -161,5 +161,5 @@ def held_out(separation: Separation, lights: Sequence[HeldOut], baseline: bool) 
             "ratio against "
             "the real picture's peak; %: RMS error of the real picture's RMS.",
         )
-        + html.table(["light", "model", "PSNR", "RMS error"], numbers),
+        + html.table(["light", "where it stands", "model", "PSNR", "RMS error"], numbers),
     )

@@ -185,3 +185,22 @@ def test_a_failed_figure_leaves_nothing(tmp_path):
 def test_what_cannot_be_drawn(rows, lights, mask, message):
     with pytest.raises(ValueError, match=message):
         comparison_figure(rows, lights, mask=mask)
+
+
+def test_lin_lees_model_itself_has_nothing_beside_it():
+    figure = comparison_figure([row()], [held_out()], mask=MASK, baseline="")
+    titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
+    assert titles == [
+        "(a) original",
+        "(b) diffuse",
+        "(c) specular",
+        "(a) real",
+        "(b) synthetic",
+        "(c) real − synthetic",
+    ]
+
+
+def test_a_held_out_light_says_where_it_stands():
+    light = held_out(place="60° off the view, outside the basis lights")
+    figure = comparison_figure([], [light], mask=MASK)
+    assert any(text.get_text().endswith("60° off the view, outside the basis lights") for text in figure.texts)
