@@ -14,6 +14,7 @@ from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     ALPHA,
+    LEAST_LOG_N_S,
     LOG_N_S,
     MOST_LOG_N_S,
     SHARED_NAMES,
@@ -35,8 +36,8 @@ from reflectsep.solve.sharing import by_chunks
 
 AMBIGUOUS_COST = 2.0
 """Two solutions whose costs differ by less are not told apart by the pictures."""
-AT_BOUND = 0.02
-"""Of log n_s."""
+NEAR_LIMIT = 0.02
+"""A log n_s this near its bound was stopped by it."""
 OUTLIER = 5.0
 """Residual, in standard deviations, that marks a pixel."""
 
@@ -205,14 +206,21 @@ def warnings(state: State, options: FitOptions) -> tuple[str, ...]:
             f"only {seen} pixels show the highlight in two or more pictures: n_s, a and B rest on the prior; "
             "the specular component is not to be trusted"
         )
-    if float(state.shared[LOG_N_S]) > MOST_LOG_N_S - AT_BOUND and bool(state.free[LOG_N_S]):
-        said.append(
-            f"n_s is at its bound of {math.exp(MOST_LOG_N_S):.0f}: what stands out does so in single pixels, as at the "
-            "edges of a print in pictures that do not lie alike; neither the specular component nor relighting is to "
-            "be trusted"
-        )
+    if bool(state.free[LOG_N_S]):
+        said += at_its_limit(float(state.shared[LOG_N_S]))
     if state.joint is not None and not state.joint.converged:
         said.append(f"the joint fit stopped at its limit of {options.max_iterations} iterations")
     if not state.obs.lights_known:
         said.append("light directions are unknown: no bound on the lobe's direction, and no relighting by direction")
     return tuple(said)
+
+
+def at_its_limit(log_n_s: float) -> list[str]:
+    """What is to be said of a fitted n_s that only its bounds have stopped."""
+    if LEAST_LOG_N_S + NEAR_LIMIT < log_n_s < MOST_LOG_N_S - NEAR_LIMIT:
+        return []
+    ends = "sharpest" if log_n_s > LEAST_LOG_N_S + NEAR_LIMIT else "broadest"
+    return [
+        f"n_s ended at {math.exp(log_n_s):.0f}, the {ends} lobe that is fitted: the pictures do not show one that all "
+        "pixels share, or do not lie alike, or the light directions are wrong; the specular component is not to be trusted"
+    ]

@@ -121,11 +121,12 @@ def scattering(separation: Separation, views: Sequence[SweepView]) -> Section | 
                 "how even the speed was, whatever the object's shape: where the slab is slow a patch is lit longer.",
             )
         )
-        parts.append(_frames(views))
+        filling = separation.document.get("settings", {}).get("scatter", {}).get("hole_filling", "another")
+        parts.append(_frames(views, str(filling)))
     return Section(key="scattering", title="Scattering from the sweeps", body="".join(parts))
 
 
-def _frames(views: Sequence[SweepView]) -> str:
+def _frames(views: Sequence[SweepView], filling: str) -> str:
     view = views[0]
     rows, heads = [], []
     for frame in view.frames:
@@ -146,5 +147,9 @@ def _frames(views: Sequence[SweepView]) -> str:
         "that the "
         "slab lights itself (grey); and with the hole filled by the maximum of its surroundings, as in the "
         "paper's Fig. 2. "
-        "For the result holes are filled as scatter.hole_filling says.",
+        + (
+            "The result's holes are filled so, too."
+            if filling == "maximum"
+            else f"The result itself was made with scatter.hole_filling={filling} instead."
+        ),
     )

@@ -12,6 +12,10 @@ ADVICE = (
         "Add lights whose mirror direction the surface faces, or lights closer to the camera; compare with "
         "fit=lin_lee.",
     ),
+    (
+        "lobe that is fitted",
+        "Check the light directions (a chrome ball: reflectsep calibrate), and whether pictures are clipped.",
+    ),
     ("stopped at its limit", "Fit again with a larger fit.max_iterations, and look whether the globals change."),
     (
         "light directions are unknown",

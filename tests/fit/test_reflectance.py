@@ -83,7 +83,7 @@ def test_an_exponent_at_its_bound_is_warned_of(small_case):
     state = replace(state, found=fit_locals(state.obs, state.priors, state.shared, state.effort, state.robust))
     sharp = state.shared.clone()
     sharp[LOG_N_S] = MOST_LOG_N_S
-    said = lambda state: any("n_s is at its bound of 200" in text for text in warnings(state, QUICK))  # noqa: E731
+    said = lambda state: any("n_s ended at 200" in text for text in warnings(state, QUICK))  # noqa: E731
     assert said(replace(state, shared=sharp))
     assert not said(state)
     held = state.free.clone()
