@@ -346,6 +346,21 @@ def test_read_out_tells_the_parameters_of_the_pixel(page, colour, colour_page):
     assert [float(w.strip(",")) for w in said["value"].split("(")[0].split()] == pytest.approx(value.tolist(), rel=1e-2)
 
 
+@pytest.mark.parametrize("width", [400, 1200])
+def test_labels_stand_on_one_line(page, colour_page, width):
+    page.size(width, 800)
+    page.open(colour_page)
+    page.run("document.querySelectorAll('details').forEach(part => part.open = true)")
+    page.call("Input.dispatchMouseEvent", type="mouseMoved", x=150, y=150)
+    page.settle()
+    lines = """[...document.querySelectorAll("details th")].map(label => {
+        const range = document.createRange(); range.selectNodeContents(label);
+        return [label.textContent, range.getClientRects().length]; })"""
+    found = page.run(lines)
+    assert len(found) > 8
+    assert [name for name, count in found if name and count != 1] == []
+
+
 def test_flags_are_marked(page, colour, colour_page):
     page.open(colour_page, "zoom=1&show=flags&flag=UNDEREXPOSED")
     seen = middle(page.pixels()).astype(int)
