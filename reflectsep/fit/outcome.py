@@ -222,5 +222,5 @@ def at_its_limit(log_n_s: float) -> list[str]:
     ends = "sharpest" if log_n_s > LEAST_LOG_N_S + NEAR_LIMIT else "broadest"
     return [
         f"n_s ended at {math.exp(log_n_s):.0f}, the {ends} lobe that is fitted: the pictures do not show one that all "
-        "pixels share, or do not lie alike, or the light directions are wrong; the specular component is not to be trusted"
+        "pixels share, do not lie alike, or the light directions are wrong; the specular component is not to be trusted"
     ]
