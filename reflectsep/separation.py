@@ -295,9 +295,9 @@ def _components(separation: Separation, stack: PhotometricStack, measured: Tenso
 
 def extensions(softness: float, crest: float) -> str:
     """Which extensions of the paper's formula a result has, in a sentence; empty where it has none."""
-    kept = (("soft shadow edges", softness), ("the lobe of GGX microfacets", crest))
-    named = [name for name, value in kept if value > 0]
-    return f"{' and '.join(named)} lowered the cost and {'were' if softness > 0 else 'was'} kept" if named else ""
+    edges = ["soft shadow edges lowered the cost and were kept"] if softness > 0 else []
+    lobe_kind = ["the lobe is that of GGX microfacets, as asked for"] if crest > 0 else []
+    return "; ".join([*edges, *lobe_kind])
 
 
 def load(folder: Path | str) -> Separation:
