@@ -137,6 +137,7 @@ def test_the_report_has_lin_and_lee_beside_where_that_is_quick_or_asked_for(resu
     assert jobs.wants_baseline(dataclasses.replace(job, baseline=True), capture)
 
 
+@pytest.mark.slow
 def test_maps_in_files_give_the_same_result_bit_for_bit(folder, captured, monkeypatch):
     made = []
     for name in ("in_memory", "in_files"):

@@ -74,9 +74,8 @@ def test_the_pretended_device_tells_what_is_not_on_it():
         assert far.to("cpu").device == CPU
 
 
-@pytest.mark.parametrize(
-    "options", [{}, pytest.param({"alpha_sd": 0.02, "lobe": "ggx", "refine_n_d": True}, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"alpha_sd": 0.02, "lobe": "ggx", "refine_n_d": True}])
 def test_chunks_are_worked_on_wholly_on_the_device(paper_case, monkeypatch, options):
     # One start and one round each: what is tested is where, not how well.
     monkeypatch.setattr(reflectance, "Effort", partial(reflectance.Effort, minima=1, rounds=1, starts=1))
