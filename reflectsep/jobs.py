@@ -40,7 +40,14 @@ from reflectsep.io.files import atomic_write, refuse_existing, refuse_folder
 from reflectsep.io.lights import read_lights
 from reflectsep.pipeline import counts_before, fit, fit_options, with_calibration
 from reflectsep.progress import Journal, Progress, Titled, silent, titled
-from reflectsep.recorded import held_out_rows, lin_lee_beside, real_pictures, recorded_capture, recorded_settings
+from reflectsep.recorded import (
+    LIN_LEE,
+    held_out_rows,
+    lin_lee_beside,
+    real_pictures,
+    recorded_capture,
+    recorded_settings,
+)
 from reflectsep.relight import LightMix, alphas_for, orbit, outside_basis, relight_to_folder
 from reflectsep.report.sheet import motion_plot
 from reflectsep.report.tone import tone, white_point
@@ -52,7 +59,7 @@ from reflectsep.workload import reading, reporting, solving
 
 PREVIEW_PIXELS = 1 << 22
 """A preview is a quick look: larger pictures are halved."""
-LIN_LEE = "Lin & Lee beside"
+BESIDE = "Lin & Lee beside"
 QUICK_S = 60.0
 """Lin & Lee's model is fitted unasked where it is expected to take no longer."""
 
@@ -143,7 +150,7 @@ def _fit_to_folder(job: FitJob, progress: Progress) -> str:
     said = f"{job.out}: {summary(separation)}"
     baseline = None
     if compared and bool(separation.s.any()):
-        baseline = lin_lee_beside(separation, capture, job.fit, Titled(journal, LIN_LEE))
+        baseline = lin_lee_beside(separation, capture, job.fit, Titled(journal, BESIDE))
     if not first:
         return said
     if job.report:
@@ -167,7 +174,7 @@ def wants_baseline(job: FitJob, capture: Capture) -> bool:
 def baseline_parts(job: FitJob, capture: Capture) -> list[Part]:
     """Parts of the fit of Lin & Lee's model."""
     counts = counts_before(capture)
-    without_s = fit_options(dataclasses.replace(job.fit, scattering="none", lobe="single"))
+    without_s = fit_options(dataclasses.replace(job.fit, **LIN_LEE))
     return [*reading(capture, counts, aligned=False, swept=False), *solving(counts, without_s, swept=False)]
 
 
@@ -175,7 +182,7 @@ def parts_after(job: FitJob, capture: Capture, compared: bool) -> list[Part]:
     """What follows a fit: Lin & Lee's, and the report."""
     if not job.report:
         return []
-    baseline = titled(baseline_parts(job, capture), LIN_LEE) if compared else []
+    baseline = titled(baseline_parts(job, capture), BESIDE) if compared else []
     return [*baseline, *reporting(counts_before(capture), len(capture.sweeps))]
 
 

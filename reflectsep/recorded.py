@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from reflectsep.calibrate.alignment import Alignment
 from reflectsep.calibrate.heldout import HeldOutPictures, Still, held_out_pictures, still_of
@@ -14,6 +15,9 @@ from reflectsep.pipeline import align_options, fit, with_calibration
 from reflectsep.progress import Progress
 from reflectsep.report.figures import HeldOut
 from reflectsep.separation import Separation
+
+LIN_LEE: dict[str, Any] = {"scattering": "none", "lobe": "single"}
+"""Settings of the fit that make it Lin & Lee's model."""
 
 
 def recorded_capture(separation: Separation, result: str) -> Path:
@@ -70,8 +74,7 @@ def lin_lee_beside(separation: Separation, capture: Capture, settings: FitSettin
         heldout=[str(name) for name in separation.document.get("heldout", [])],
         alignment=recorded_alignment(separation),
         progress=progress,
-        scattering="none",
-        lobe="single",
+        **LIN_LEE,
     )
 
 

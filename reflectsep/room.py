@@ -85,11 +85,16 @@ def stacked(parts: Iterator[Tensor] | list[Tensor], count: int) -> Tensor:
     return result
 
 
+def cuts(count: int, at_once: int) -> Iterator[slice]:
+    """0 .. count - 1, `at_once` at a time."""
+    for start in range(0, count, at_once):
+        yield slice(start, min(start + at_once, count))
+
+
 def by_rows(count: int, at_once: int, work: Callable[[slice], Tensor]) -> Tensor:
     """What `work` gives for rows 0 .. count - 1, `at_once` at a time; an empty cut where there are none."""
     result: Tensor | None = None
-    for start in range(0, max(count, 1), at_once):
-        cut = slice(start, min(start + at_once, count))
+    for cut in cuts(count, at_once) if count else (slice(0, 0),):
         part = work(cut)
         if result is None:
             result = rows(count, part)

@@ -30,7 +30,7 @@ from reflectsep.errors import ResultError
 from reflectsep.flags import count
 from reflectsep.io.result import read_result, write_result
 from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_power, reflectance
-from reflectsep.room import empty, room_beside, stacked
+from reflectsep.room import cuts, empty, room_beside, stacked
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
 LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
@@ -260,9 +260,7 @@ def lobe_ceiling(separation: Separation) -> Float[Tensor, ""]:
 def bands(mask: Bool[Tensor, "height width"]) -> Iterator[slice]:
     """Rows of a picture, about `PIXELS_AT_ONCE` at a time."""
     height, width = mask.shape
-    band = max(1, PIXELS_AT_ONCE // width)
-    for top in range(0, height, band):
-        yield slice(top, min(top + band, height))
+    return cuts(height, max(1, PIXELS_AT_ONCE // width))
 
 
 def with_components(separation: Separation, stack: PhotometricStack, measured: Callable[[slice], Tensor]) -> Separation:

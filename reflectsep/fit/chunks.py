@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from torch import Tensor
 
-from reflectsep.room import by_rows
+from reflectsep import room
 
 AT_ONCE = 1 << 15
 """Pixels: some ten megabytes of what is in between."""
@@ -14,13 +14,12 @@ AT_ONCE = 1 << 15
 
 def cuts(pixels: int) -> Iterator[slice]:
     """0 .. pixels - 1, `AT_ONCE` at a time."""
-    for start in range(0, pixels, AT_ONCE):
-        yield slice(start, min(start + AT_ONCE, pixels))
+    return room.cuts(pixels, AT_ONCE)
 
 
 def in_chunks(pixels: int, work: Callable[[slice], Tensor]) -> Tensor:
     """What `work` gives for the pixels of every cut, in their order; for work on each pixel by itself."""
-    return by_rows(pixels, AT_ONCE, work)
+    return room.by_rows(pixels, AT_ONCE, work)
 
 
 def taken(values: Tensor, index: Tensor) -> Tensor:
