@@ -17,6 +17,7 @@ from reflectsep.export.harmonics import ptm_terms
 from reflectsep.io.exr import read_channels
 from reflectsep.io.lights import read_lights
 from reflectsep.io.pictures import read_picture
+from reflectsep.io.stack import windowed
 from reflectsep.relight import LightMix, alphas_for, place_of
 from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
 from reflectsep.report.metrics import psnr, relative_rms
@@ -111,8 +112,9 @@ def beside(ours: Separation, baseline: Separation, capture: Capture, still: Stil
         file = capture.folder / "heldout" / f"{name}.exr"
         if file.is_file():
             real, _ = read_picture(file)
-            if real.shape != ours.d.shape[1:]:
-                raise CaptureError(f"{file}: {tuple(real.shape)}, but the result is {tuple(ours.d.shape[1:])}")
+            (part,) = windowed(file, capture.region, real)
+            if part.shape != ours.d.shape[1:]:
+                raise CaptureError(f"{file}: {tuple(part.shape)}, but the result is {tuple(ours.d.shape[1:])}")
             finite = torch.isfinite(real)
             real, bad, motion = still.place(torch.where(finite, real, 0.0), ~finite)
             row = held_out(name, real, ours, baseline, mix, counts=~bad.any(0))
@@ -180,9 +182,14 @@ def truth_lines(ours: Separation, baseline: Separation, capture: Capture) -> lis
         planes = read_channels(file)
         channels = ("Y",) if ours.d.shape[1] == 1 else ("R", "G", "B")
 
-        def truth(layer: str, planes: dict = planes, channels: tuple[str, ...] = channels) -> Tensor | None:
+        def truth(
+            layer: str, planes: dict = planes, channels: tuple[str, ...] = channels, file: Path = file
+        ) -> Tensor | None:
             keys = [f"{layer}.{c}" for c in channels]
-            return torch.stack([torch.from_numpy(planes[k]).float() for k in keys]) if keys[0] in planes else None
+            if keys[0] not in planes:
+                return None
+            whole = torch.stack([torch.from_numpy(planes[k]).float() for k in keys])
+            return windowed(file, capture.region, whole)[0]
 
         specular, scattering = truth("specular"), truth("scattering_beyond_1px")
         if specular is not None:

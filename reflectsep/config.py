@@ -160,6 +160,12 @@ class FitSettings:
     prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
     device: Literal["cpu", "cuda"] = setting("cpu", "where chunks of pixels are solved; for cuda a larger fit.chunk")
+    globals_from: str | None = setting(
+        None, "result of another part of the object, or of another fit of it, to take the globals from", path=True
+    )
+    globals: Literal["held", "start"] = setting(
+        "held", "those globals, C, n_d and priors are not fitted again, or the globals are where the fit starts"
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -273,6 +279,9 @@ class FitJob:
     out: str = setting("", "result folder to write; default results/NAME", path=True)
     overwrite: bool = setting(False, "replace what is there")
     basis: list[str] | None = setting(None, "names of three basis lights; null: the capture's", length=3)
+    region: list[int] | None = setting(
+        None, "x, y, width, height in pixels from the top left: all that is kept of the pictures; null: all", length=4
+    )
     heldout: list[str] | None = setting(None, "names of lights to leave out of the fit")
     lights_file: str | None = setting(None, "light directions (.lp, .txt, .json) instead of the capture's", path=True)
     report: bool = setting(True, "write report.html beside the result")

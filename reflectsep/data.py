@@ -101,6 +101,43 @@ class Encoding:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Region:
+    """A window of a picture, in whole pixels from its top left corner."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    @property
+    def rows(self) -> slice:
+        """Of the whole picture."""
+        return slice(self.y, self.y + self.height)
+
+    @property
+    def columns(self) -> slice:
+        """Of the whole picture."""
+        return slice(self.x, self.x + self.width)
+
+    def of(self, picture: Tensor) -> Tensor:
+        """The window of a picture (..., height, width), in memory of its own."""
+        return picture[..., self.rows, self.columns].clone()
+
+    def inside(self, size: tuple[int, int]) -> bool:
+        """Whether all of it is in a picture of `size` (width, height)."""
+        width, height = size
+        some = self.width > 0 and self.height > 0
+        return some and self.x >= 0 and self.y >= 0 and self.x + self.width <= width and self.y + self.height <= height
+
+    def plain(self) -> list[int]:
+        """x, y, width, height."""
+        return [self.x, self.y, self.width, self.height]
+
+    def __str__(self) -> str:
+        return f"[{self.x},{self.y},{self.width},{self.height}]"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Capture:
     """A capture folder's manifest: everything by name, no picture read yet."""
 
@@ -110,7 +147,9 @@ class Capture:
     view: Vector = (0.0, 0.0, 1.0)
     encoding: Encoding = Encoding()
     size: tuple[int, int] | None = None
-    """(width, height)."""
+    """(width, height) of the files."""
+    region: Region | None = None
+    """The only part of every file that is to be kept; None: all of it."""
     mask: str | None = None
     lights: Mapping[str, Light]
     basis: tuple[str, str, str]
@@ -212,6 +251,8 @@ class SweepReport:
     """Robust relative deviation of the slab from constant speed."""
     coverage: float
     """Fraction of the object's pixels that the slab lit."""
+    step_px: float = 1.0
+    """Pixels that the slab moves in a frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,6 +276,25 @@ class Scattering:
     def invalid(self) -> Bool[Tensor, "height width"]:
         """Pixels whose root is not finite under at least one light; they are not fitted."""
         return ~self.root.isfinite().all(1).all(0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learnt:
+    """What a fit has found out of an object as a whole: all that pixels share, and that another fit can take over."""
+
+    shared: tuple[float, ...]
+    """Every global, as `reflectsep.fit.problem` orders them."""
+    order: tuple[str, ...]
+    """Of `covariance`: the globals that were free."""
+    covariance: tuple[tuple[float, ...], ...]
+    noise: float
+    """Standard deviation of one residual, in the capture's units."""
+    shape: float
+    """1 / standard deviation of log B about its geometric value."""
+    height: float
+    """Highest peak of the lobe that is believed."""
+    scales: tuple[tuple[float, float], ...] = ()
+    """Width in pixels of each neighbourhood that had a say in the lobes, and the spread of lobes about it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,4 +330,5 @@ class Fit:
     cost: float
     iterations: int
     history: tuple[Mapping[str, float], ...] = field(default=())
+    learnt: Learnt | None = None
     warnings: tuple[str, ...] = ()

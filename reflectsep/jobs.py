@@ -44,6 +44,7 @@ from reflectsep.recorded import (
     LIN_LEE,
     held_out_rows,
     lin_lee_beside,
+    opened_again,
     real_pictures,
     recorded_capture,
     recorded_settings,
@@ -129,7 +130,10 @@ def run_fit(job: FitJob, progress: Progress = silent) -> str:
 
 def _fit_to_folder(job: FitJob, progress: Progress) -> str:
     capture = load_capture(
-        job.capture, basis=None if job.basis is None else tuple(job.basis), lights_file=job.lights_file
+        job.capture,
+        basis=None if job.basis is None else tuple(job.basis),
+        lights_file=job.lights_file,
+        region=job.region,
     )
     compared = wants_baseline(job, capture)
     journal = Journal(progress, after=parts_after(job, capture, compared))
@@ -224,8 +228,7 @@ def run_compare(job: CompareJob, progress: Progress = silent) -> str:
     refuse_existing(Path(job.out), job.overwrite)
     separation = load(job.result)
     folder = recorded_capture(separation, job.result) if job.capture is None else Path(job.capture)
-    lights_file = separation.document.get("lights_file")
-    capture = load_capture(folder, basis=separation.basis, lights_file=lights_file)
+    capture = opened_again(separation, folder)
     baseline = separation
     if bool(separation.s.any()):  # else it is Lin & Lee's model itself
         baseline = lin_lee_beside(separation, capture, recorded_settings(separation, job.result), progress)
@@ -240,8 +243,7 @@ def run_report(job: ReportJob, progress: Progress = silent) -> str:
     capture, baseline, rows = None, None, []
     named = job.capture or str(separation.document.get("capture") or "")
     if job.capture is not None or Path(named, "").is_dir():
-        lights_file = separation.document.get("lights_file")
-        capture = load_capture(named, basis=separation.basis, lights_file=lights_file)
+        capture = opened_again(separation, named)
         # A result without scattering is Lin & Lee's model itself.
         if job.baseline and bool(separation.s.any()):
             journal = Journal(progress, after=reporting(counts_before(capture), len(capture.sweeps)))

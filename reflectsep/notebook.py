@@ -14,6 +14,7 @@ from torch import Tensor
 
 from reflectsep.flags import count
 from reflectsep.io.pictures import read_picture, write_picture
+from reflectsep.io.stack import windowed
 from reflectsep.srgb import encoded
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ def capture_html(capture: Capture) -> str:
     rows: list[tuple[str, object]] = [("object", capture.object), ("folder", capture.folder)]
     if capture.size is not None:
         rows.append(("size", f"{capture.size[0]} x {capture.size[1]} px"))
+    if capture.region is not None:
+        rows.append(("region", f"{capture.region} (x, y, width, height)"))
     rows += [("encoding", capture.encoding.kind), ("basis", ", ".join(capture.basis))]
     for name in capture.names:
         direction = capture.lights[name].direction if name in capture.lights else None
@@ -88,7 +91,8 @@ def capture_plot(capture: Capture) -> Chart:
     """The full pictures as stored, brightest value white."""
     from reflectsep.report.charts import Panel, grid
 
-    pictures = {name: read_picture(capture.folder / capture.full(name).file)[0] for name in capture.names}
+    files = {name: capture.folder / capture.full(name).file for name in capture.names}
+    pictures = {name: windowed(file, capture.region, read_picture(file)[0])[0] for name, file in files.items()}
     panels = []
     for name, picture in pictures.items():
         white = max(1e-12, float(torch.nan_to_num(picture).max()))

@@ -23,6 +23,7 @@ from reflectsep.data import Capture, PhotometricStack, Scattering
 from reflectsep.errors import FitError, LightError, ReflectsepError, SettingsError, SweepError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
+from reflectsep.handed import learnt_document, read_handed
 from reflectsep.io import calibration as calibration_file
 from reflectsep.io.capture import load_capture
 from reflectsep.io.files import inside
@@ -31,7 +32,7 @@ from reflectsep.io.pictures import read_picture
 from reflectsep.io.stack import read_full, read_mask
 from reflectsep.progress import Progress, expect, silent
 from reflectsep.scatter.measure import measure_scattering
-from reflectsep.scatter.options import ScatterOptions
+from reflectsep.scatter.options import HeldSweeps, ScatterOptions
 from reflectsep.separation import Separation, load, separate
 from reflectsep.settings import nearest
 from reflectsep.summary import describe
@@ -105,25 +106,34 @@ def separated(
 ) -> Separation:
     """The stages of `fit`, one after the other."""
     clock = Clock()
+    handed = read_handed(settings)
     capture, used = with_calibration(capture, calibration.file)
     capture = without(capture, heldout)
+    if handed is not None:
+        handed.require_capture(capture, settings, scatter)
     least = 8 if settings.scattering == "unknown" else 6
     aligned = alignment is None and calibration.registration != "none"
     swept = bool(capture.sweeps) and settings.scattering == "measured"
     foreseen, options = counts_before(capture), fit_options(settings)
+    if handed is not None:
+        options = dataclasses.replace(options, given=handed.learnt)
     ahead = reading(capture, foreseen, aligned=aligned, swept=swept)
     expect(progress, [*ahead, *solving(foreseen, options, swept=swept)])
-    if aligned:
+    if aligned and handed is not None:
+        alignment = handed.motions(capture)
+    if aligned and alignment is None:
         alignment = alignment_of(capture, calibration, scatter, progress)
         clock.lap("alignment")
     progress("pictures", 0, 1)
     stack, lights = calibrate_stack(capture, minimum=least, alignment=alignment)
     progress("pictures", 1, 1)
+    stack = stack if handed is None else handed.applied(stack)
     found = counts_of(stack)
     ahead = [part for part in reading(capture, found, aligned=False, swept=swept) if part.name != "pictures"]
     expect(progress, [*ahead, *solving(found, options, swept=swept)])
     clock.lap("pictures")
-    scattering = measure(capture, stack, settings, scatter, progress, alignment)
+    held = handed.sweeps if handed is not None and handed.held else None
+    scattering = measure(capture, stack, settings, scatter, progress, alignment, held)
     clock.lap("scattering")
     fitted = fit_reflectance(stack, scattering, options, progress=progress)
     clock.lap("fit")
@@ -144,17 +154,20 @@ def separated(
     )
     if used is not None:
         document["calibration_file"] = used
+    if handed is not None:
+        document["globals_from"] = handed.document()
+    document |= learnt_document(fitted.learnt, stack, scattering, capture.exposure_s)
     return separate(stack, scattering, fitted, document)
 
 
 def counts_before(capture: Capture) -> Counts:
     """How large a capture is, by its mask and one picture; what is wrong with them is said where they are used."""
     try:
-        pixels = int(read_mask(capture).sum())
+        mask = read_mask(capture)
         values, _ = read_picture(inside(capture.folder, capture.full(capture.basis[0]).file))
     except (ReflectsepError, OSError):
         return Counts(size=1, pixels=1, lights=len(capture.names), channels=1)
-    return Counts(size=values[0].numel(), pixels=pixels, lights=len(capture.names), channels=len(values))
+    return Counts(size=mask.numel(), pixels=int(mask.sum()), lights=len(capture.names), channels=len(values))
 
 
 def counts_of(stack: PhotometricStack) -> Counts:
@@ -179,15 +192,20 @@ def changed(settings: FitSettings, changes: Mapping[str, Any]) -> FitSettings:
 def alignment_of(
     capture: Capture, calibration: CalibrationSettings, scatter: ScatterSettings, progress: Progress = silent
 ) -> Alignment:
-    """Motions of a capture's pictures and sweeps."""
+    """Motions of a capture's pictures and sweeps; of a region those of the whole.
+
+    A part may show too little of the object, and parts that move each its own way do not fit together.
+    """
+    region, capture = capture.region, dataclasses.replace(capture, region=None)
     response = response_of(capture)
     raw = read_full(capture)
     pictures, saturated = develop_pictures(capture, raw, response)
     streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
     options = align_options(calibration, scatter.n_d or 1.0)
-    return align(
+    found = align(
         capture, raw.names, pictures, saturated, read_mask(capture), streams, options=options, progress=progress
     )
+    return found if region is None else found.in_window(region.x, region.y, (region.width, region.height))
 
 
 def align_options(calibration: CalibrationSettings, n_d: float = 1.0) -> AlignOptions:
@@ -203,6 +221,7 @@ def measure(
     scatter: ScatterSettings,
     progress: Progress,
     alignment: Alignment | None = None,
+    held: HeldSweeps | None = None,
 ) -> Scattering | None:
     """Scattering from the sweeps; None where the capture has none or the fit wants none."""
     if not capture.sweeps or settings.scattering != "measured":
@@ -213,7 +232,7 @@ def measure(
         if sweep.light in stack.names:
             stream = developed_stream(capture, open_sweep(capture, sweep), response)
             streams.append(stream if alignment is None else alignment.placed(i, stream))
-    options = ScatterOptions(**dataclasses.asdict(scatter))
+    options = ScatterOptions(**dataclasses.asdict(scatter), held=held)
     return measure_scattering(stack, streams, options=options, progress=progress)
 
 
@@ -226,7 +245,9 @@ def fit_options(settings: FitSettings) -> FitOptions:
     if settings.device == "cuda" and not torch.cuda.is_available():
         built = f"torch {torch.__version__} is built {'for' if torch.version.cuda else 'without'} CUDA"
         raise SettingsError(f"{settings.key}device=cuda: no CUDA device is to be had ({built}); expected cpu")
-    return FitOptions(**dataclasses.asdict(settings))
+    chosen = dataclasses.asdict(settings)
+    del chosen["globals_from"]
+    return FitOptions(**chosen)
 
 
 class Clock:

@@ -11,13 +11,14 @@ from reflectsep.comparison import beside, left_out
 from reflectsep.config import CalibrationSettings, FitSettings
 from reflectsep.data import Capture
 from reflectsep.errors import ResultError, SettingsError
+from reflectsep.io.capture import load_capture
 from reflectsep.pipeline import align_options, fit, with_calibration
 from reflectsep.progress import Progress
 from reflectsep.report.figures import HeldOut
 from reflectsep.separation import Separation
 
-LIN_LEE: dict[str, Any] = {"scattering": "none", "lobe": "single"}
-"""Settings of the fit that make it Lin & Lee's model."""
+LIN_LEE: dict[str, Any] = {"scattering": "none", "lobe": "single", "globals_from": None}
+"""Settings of the fit that make it Lin & Lee's model, whose globals are its own."""
 
 
 def recorded_capture(separation: Separation, result: str) -> Path:
@@ -30,6 +31,22 @@ def recorded_capture(separation: Separation, result: str) -> Path:
     if not named or not Path(str(named)).is_dir():
         raise ResultError(f"{result}: its capture {str(named)!r} is not there; give capture=FOLDER to compare with")
     return Path(str(named))
+
+
+def opened_again(separation: Separation, folder: Path | str) -> Capture:
+    """The capture in `folder` with the basis, the list of lights and the region that a result was made with.
+
+    Raises:
+        CaptureError, LightError: as `load_capture`.
+        ResultError: the result's region is none.
+    """
+    document = separation.document
+    region = document.get("region")
+    if region is not None and not (
+        isinstance(region, list) and len(region) == 4 and all(type(v) is int for v in region)
+    ):
+        raise ResultError(f"{folder}: its result has region {region!r:.80}; x, y, width, height were expected")
+    return load_capture(folder, basis=separation.basis, lights_file=document.get("lights_file"), region=region)
 
 
 def recorded_settings(separation: Separation, result: str) -> FitSettings:

@@ -50,7 +50,7 @@ class Kind:
             names[dict] = "keys with values"
             words = names.get(self.base, self.base.__name__)
             if self.base is list:
-                words = "a list of numbers" if self.item is float else "a list of names"
+                words = {float: "a list of numbers", int: "a list of whole numbers"}.get(self.item, "a list of names")
         return f"{words} or null" if self.optional else words
 
 

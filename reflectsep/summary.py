@@ -51,6 +51,7 @@ def describe(  # noqa: PLR0913  (every stage has its say)
     document: dict[str, Any] = {
         "object": capture.object,
         "capture": str(capture.folder.resolve()),
+        **({} if capture.region is None else {"region": capture.region.plain()}),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "model": model,
         "heldout": list(heldout),
@@ -139,6 +140,13 @@ def summary(separation: Separation, *, full: bool = False) -> str:
         lines.append(f"  lights    {', '.join(separation.names)}; basis {', '.join(separation.basis)}")
         height, width = separation.mask.shape
         lines.append(f"  size      {width} x {height}, {int(separation.mask.sum())} pixels on the object")
+        taken = document.get("globals_from")
+        if taken:
+            words = "held as they are in" if taken["use"] == "held" else "started from"
+            lines.append(f"  globals   {words} {taken['result']}")
+        if document.get("region"):
+            x, y, w, h = document["region"]
+            lines.append(f"  region    {w} x {h} pixels of the capture's pictures, from column {x}, row {y}")
         kept = extensions(float(separation.softness), float(separation.crest))
         lines += [f"  beyond    {kept}"] if kept else []
         for name, entry in document.get("alpha_refined", {}).items():

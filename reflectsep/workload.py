@@ -87,13 +87,15 @@ def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
     """Parts of the fit itself."""
     effort = _effort(counts)
     globals_s = [s * effort**1.7 * options.globals_pixels / 300 for s in GLOBALS_S]
-    if options.prior != "auto":
+    if options.held is not None:
+        globals_s = []
+    elif options.prior != "auto":
         globals_s = globals_s[:1]
     parts = [Part(name="globals", label="globals", expected_s=s, steps="even") for s in globals_s]
     wanted = ["pixels"]
     if options.method == "joint":
         wanted.append("joint fit")
-        if options.lobe != "single" and swept:
+        if options.lobe != "single" and swept and options.held is None:
             wanted.append("shadow edges")
         if swept:
             wanted.append("neighbourhood")

@@ -22,7 +22,7 @@ from reflectsep.calibrate.across_lights import across
 from reflectsep.calibrate.align_options import MARGIN_PX, AlignOptions, grown, judged
 from reflectsep.calibrate.aligned_stream import after, aligned_stream
 from reflectsep.calibrate.bracket_motion import bracket_motions
-from reflectsep.calibrate.motion import Motion, displacement, inside, positions, warp
+from reflectsep.calibrate.motion import Motion, displacement, inside, positions, shifted, warp
 from reflectsep.calibrate.register import RegisterOptions, register
 from reflectsep.calibrate.sweep_sum import SweepSum, add_frames, roots_of
 from reflectsep.data import Capture, FrameStream, Sweep
@@ -66,6 +66,22 @@ class Alignment:
     def _exposures(self) -> tuple[tuple[Motion, ...], ...]:
         return self.exposures or tuple(() for _ in self.sweeps)
 
+    def in_window(self, x: int, y: int, size: tuple[int, int]) -> Alignment:
+        """The same motions where pixels are counted from (x, y) of these pictures, in a window of `size`."""
+        origin = shifted(float(x), float(y))
+
+        def there(motion: Motion) -> Motion:
+            return replace(motion, matrix=shifted(float(-x), float(-y)) @ motion.matrix @ origin)
+
+        return replace(
+            self,
+            pictures={name: there(motion) for name, motion in self.pictures.items()},
+            sweeps=tuple(there(motion) for motion in self.sweeps),
+            against_full=tuple(there(motion) for motion in self.against_full),
+            exposures=tuple(tuple(there(motion) for motion in each) for each in self.exposures),
+            size=size,
+        )
+
     def placed(self, i: int, stream: FrameStream) -> FrameStream:
         """Developed frames of the capture's sweep `i` as the first basis picture has them."""
         return aligned_stream(stream, self.sweeps[i], self._exposures()[i])
@@ -99,6 +115,7 @@ class Alignment:
             pictures={str(name): Motion.from_document(motion) for name, motion in dict(document["pictures"]).items()},
             sweeps=tuple(Motion.from_document(sweep) for sweep in sweeps),
             against_full=tuple(Motion.from_document(sweep["against_full"]) for sweep in sweeps),
+            exposures=tuple(tuple(map(Motion.from_document, sweep.get("exposures", ()))) for sweep in sweeps),
             size=None if size is None else (int(size[0]), int(size[1])),
         )
 

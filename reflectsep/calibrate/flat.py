@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from kornia.filters import gaussian_blur2d
@@ -10,7 +12,7 @@ from torch import Tensor
 from reflectsep.calibrate.develop import Response, develop
 from reflectsep.data import Capture, Picture
 from reflectsep.errors import CaptureError
-from reflectsep.io.stack import read_dark, read_mask, read_one
+from reflectsep.io.stack import read_dark, read_mask, read_one, windowed
 
 BLUR_PX = 2.0
 """A flat's own noise would go into every picture; unevenness is smooth."""
@@ -27,6 +29,8 @@ def flat_of(capture: Capture, light: str | None, response: Response) -> Float[Te
     found = _choose(capture, light)
     if found is None:
         return None
+    # Of the whole object also where only a region is kept: parts must not differ by their flats' means.
+    region, capture = capture.region, replace(capture, region=None)
     values = develop(read_one(capture, found.file), response, read_dark(capture, found.exposure_s), 1.0)
     mask = read_mask(capture)
     place = capture.folder / found.file
@@ -43,7 +47,7 @@ def flat_of(capture: Capture, light: str | None, response: Response) -> Float[Te
             f"{place}: a flat field of {float(field[:, mask].min()):.1%} of its mean somewhere on the object; expected "
             f"at least {LEAST:.0%}"
         )
-    return field.clamp_min(LEAST)
+    return windowed(place, region, field.clamp_min(LEAST))[0]
 
 
 def _choose(capture: Capture, light: str | None) -> Picture | None:

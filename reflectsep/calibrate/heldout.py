@@ -19,7 +19,7 @@ from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.exposure import response_of
 from reflectsep.calibrate.motion import Motion, warp
 from reflectsep.calibrate.stack import check_names, develop_pictures
-from reflectsep.data import Capture
+from reflectsep.data import Capture, Region
 from reflectsep.errors import LightError
 from reflectsep.io.stack import read_full, read_mask
 
@@ -45,11 +45,17 @@ class Still:
     mask: Bool[Tensor, "height width"]
     options: AlignOptions | None
     """None, or with the scope `same_light`: pictures stay as they lie."""
+    region: Region | None = None
+    """What is kept of a picture once it is in its place."""
 
     def place(
         self, picture: Float[Tensor, "channels height width"], bad: Bool[Tensor, "channels height width"]
     ) -> tuple[Tensor, Tensor, Motion]:
         """A picture in the reference's place, resampled once or not at all; its bad values; and the motion."""
+        values, clipped, motion = self._placed(picture, bad)
+        return kept(self.region, values), kept(self.region, clipped), motion
+
+    def _placed(self, picture: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Motion]:
         if self.options is None or self.options.scope != "all" or picture.shape[1:] != self.grey.shape:
             return picture, bad, Motion(reason="not looked for")
         motion = across(self.grey, torch.where(bad, 0.0, picture).mean(0).double(), self.mask, self.options)
@@ -65,8 +71,14 @@ def still_of(capture: Capture, options: AlignOptions | None) -> Still:
     Raises:
         CaptureError: a picture or mask that cannot be read.
     """
+    region, capture = capture.region, replace(capture, region=None)
     _, pictures, _ = _developed(capture, [])
-    return Still(grey=pictures[0].mean(0).double(), mask=read_mask(capture), options=options)
+    return Still(grey=pictures[0].mean(0).double(), mask=read_mask(capture), options=options, region=region)
+
+
+def kept(region: Region | None, picture: Tensor) -> Tensor:
+    """What is kept of a picture (..., height, width)."""
+    return picture if region is None else region.of(picture)
 
 
 def held_out_pictures(capture: Capture, names: Sequence[str], options: AlignOptions | None = None) -> HeldOutPictures:
@@ -84,13 +96,15 @@ def held_out_pictures(capture: Capture, names: Sequence[str], options: AlignOpti
     check_names(capture, names)
     if not names:
         raise LightError(f"{capture.folder}: no held-out lights named; expected at least one")
+    # Registered whole: a part may show too little of the object, or none of its edges.
+    region, capture = capture.region, replace(capture, region=None)
     found, pictures, bad = _developed(capture, names)
     still = Still(grey=pictures[0].mean(0).double(), mask=read_mask(capture), options=options)
     placed = [still.place(pictures[i], bad[i]) for i in (found.index(name) for name in names)]
     return HeldOutPictures(
         names=tuple(names),
-        values=torch.stack([values for values, _, _ in placed]),
-        clipped=torch.stack([clipped for _, clipped, _ in placed]),
+        values=torch.stack([kept(region, values) for values, _, _ in placed]),
+        clipped=torch.stack([kept(region, clipped) for _, clipped, _ in placed]),
         motions=tuple(motion for _, _, motion in placed),
     )
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from reflectsep.data import Learnt
+
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
@@ -44,3 +46,13 @@ class FitOptions:
     dtype: Literal["float32", "float64"] = "float64"
     device: Literal["cpu", "cuda"] = "cpu"
     """Where chunks are searched and solved; what is kept of all pixels, and all other work, is the processor's."""
+    given: Learnt | None = None
+    """What another fit has learnt of the same object."""
+    globals: Literal["held", "start"] = "held"
+    """Where something is given: its globals, noise and strengths of priors are those of this fit, or its globals are
+    where this fit starts."""
+
+    @property
+    def held(self) -> Learnt | None:
+        """What is given, where nothing of it is fitted again."""
+        return self.given if self.globals == "held" else None

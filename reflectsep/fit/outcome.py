@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from reflectsep.data import Fit, PhotometricStack, Scattering
+from reflectsep.data import Fit, Learnt, PhotometricStack, Scattering
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.chunks import in_chunks
 from reflectsep.fit.options import FitOptions
@@ -52,7 +52,14 @@ def describe(
     """The finished fit as pictures in single precision; zero outside the mask."""
     obs, mask, shared = state.obs, state.mask, state.shared
     x, g = unpack(state.found.local, obs.channels), unpack_globals(shared, obs.n_d)
-    covariance = shared_covariance(state)
+    names = names_of(stack, state)
+    if options.held is None:
+        covariance = shared_covariance(state)
+        order = tuple(name for name, free in zip(names, state.free.tolist(), strict=True) if free)
+    else:
+        covariance, order = carried_covariance(options.held, names, shared), options.held.order
+    chosen = torch.tensor([names.index(name) for name in order], dtype=torch.long)
+    told = covariance[chosen][:, chosen]
     local_sd = local_deviation(state, covariance)
     sd = unpack(local_sd, obs.channels)
     B, B_sd = x.B, x.B * sd.log_B
@@ -64,8 +71,8 @@ def describe(
         n_d=torch.as_tensor(g.n_d).float(),
         softness=g.softness.abs().float(),
         crest=g.crest.float(),
-        global_names=tuple(n for n, free in zip(names_of(stack, state), state.free.tolist(), strict=True) if free),
-        covariance=covariance[state.free][:, state.free],
+        global_names=order,
+        covariance=told,
         d=picture(x.d),
         s=picture(in_chunks(len(obs), lambda cut: s_of_pixels(state, cut))),
         B=picture(B[:, None, None].expand(-1, obs.channels, 1))[0],
@@ -80,8 +87,26 @@ def describe(
         cost=float(state.found.cost.sum()),
         iterations=state.joint.iterations if state.joint is not None else 0,
         history=tuple({"cost": c} for c in (state.joint.history if state.joint is not None else ())),
+        learnt=Learnt(
+            shared=tuple(shared.tolist()),
+            order=order,
+            covariance=tuple(tuple(row) for row in told.tolist()),
+            noise=state.sigma,
+            shape=state.priors.shape,
+            height=state.priors.height,
+            scales=state.scales,
+        ),
         warnings=warnings(state, options),
     )
+
+
+def carried_covariance(held: Learnt, names: tuple[str, ...], like: Tensor) -> Float[Tensor, "G G"]:
+    """Covariance of the globals by the fit that they come from, zero where that held them."""
+    covariance = like.new_zeros(len(names), len(names))
+    index = torch.tensor([names.index(name) for name in held.order], dtype=torch.long)
+    values = torch.tensor(held.covariance, dtype=like.dtype).reshape(len(index), len(index))
+    covariance[index[:, None], index] = values
+    return covariance
 
 
 def names_of(stack: PhotometricStack, state: State) -> tuple[str, ...]:
@@ -201,7 +226,7 @@ def warnings(state: State, options: FitOptions) -> tuple[str, ...]:
     said = []
     in_two = lambda cut: (shine_of(state, cut) > 3.0 * state.sigma).sum(-1) >= 2  # noqa: E731
     seen = int(in_chunks(len(state.obs), in_two).sum())
-    if seen < 30:
+    if seen < 30 and options.held is None:
         said.append(
             f"only {seen} pixels show the highlight in two or more pictures: n_s, a and B rest on the prior; "
             "the specular component is not to be trusted"

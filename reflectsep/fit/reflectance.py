@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.data import Fit, PhotometricStack, Scattering
+from reflectsep.data import Fit, Learnt, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.body import extend_into_shadow, robust_body
@@ -35,8 +35,11 @@ from reflectsep.fit.problem import (
     ALPHA,
     GGX,
     LOG_C_2,
+    LOG_N_D,
+    LOG_N_S,
     SOFTNESS,
     Observations,
+    Priors,
     no_priors,
     unpack,
 )
@@ -91,6 +94,8 @@ def fit_reflectance(
     """
     if options.alpha_sd > 0 and options.method != "joint":
         raise FitError(f"alpha_sd {options.alpha_sd:g} with method {options.method}: alphas are refined jointly alone")
+    if options.held is not None:
+        options = replace(options, refine_n_d="log_n_d" in options.held.order)
     dtype = torch.float64 if options.dtype == "float64" else torch.float32
     obs, mask, intensity = observe(stack, scattering, options, dtype)
     state = prepare(obs, mask, options)
@@ -180,7 +185,8 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     def rms(cut: slice) -> Tensor:
         return (obs.images[cut] - diffuse(body[cut] @ obs.alpha.mT, flat, n_d)).square().mean((1, 2)).sqrt()
 
-    sigma = noise_of(obs.images, in_chunks(len(obs), rms), 3)
+    held = options.held
+    sigma = noise_of(obs.images, in_chunks(len(obs), rms), 3) if held is None else held.noise
     body = robust_body(obs.images, alike(1.0 / sigma), obs.alpha, n_d)
     obs = replace(obs, s=beyond_the_edge(obs, body), weight=weights(obs, options, sigma))
     shared = initial_shared(obs.images, obs.cosine, n_d, options.n_s)
@@ -195,11 +201,15 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
         priors = replace(priors, parallel=torch.zeros_like(priors.parallel))
         priors = replace(priors, ratio_weight=torch.zeros_like(priors.ratio_weight))
     free = torch.tensor([True, True, True, options.n_s is None, True, False, False, options.refine_n_d])
-    if options.alpha_sd > 0:
-        priors = replace(priors, alpha_sd=options.alpha_sd)
+    if held is not None:
+        priors = replace(priors, shape=held.shape, height=held.height)
+    if options.alpha_sd > 0 if held is None else len(held.shared) > ALPHA:
+        priors = replace(priors, alpha_sd=options.alpha_sd or priors.alpha_sd)
         others = 3 * (len(obs.alpha) - 3)
         shared = torch.cat([shared, shared.new_zeros(others)])
         free = torch.cat([free, torch.zeros(others, dtype=torch.bool)])
+    if options.given is not None:
+        shared, free = from_given(shared, free, options.given, held=held is not None)
     polish = Termination(tolerance=options.tolerance * 1e-2, max_iterations=60)
     chunk = -(-options.chunk // obs.channels)
     joint = JointOptions(max_iterations=options.max_iterations, tolerance=options.tolerance, chunk=chunk)
@@ -217,6 +227,23 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
         body=body,
         found=nothing,
     )
+
+
+def from_given(
+    shared: Float[Tensor, "G"], free: Bool[Tensor, "G"], given: Learnt, *, held: bool
+) -> tuple[Float[Tensor, "G"], Bool[Tensor, "G"]]:
+    """Globals as another fit left them, and which of them are fitted on."""
+    count = min(len(shared), len(given.shared))
+    # An exponent that is fixed stays what it is.
+    keep = free.clone()
+    keep[[i for i in range(len(free)) if held or i not in (LOG_N_S, LOG_N_D)]] = True
+    taken, free = shared.clone(), free.clone()
+    taken[:count] = torch.tensor(given.shared[:count], dtype=shared.dtype)
+    shared = torch.where(keep, taken, shared)
+    if held:
+        return shared, torch.zeros_like(free)
+    free[SOFTNESS] = bool(shared[SOFTNESS] != 0)
+    return shared, free
 
 
 def beyond_the_edge(
@@ -256,6 +283,35 @@ def weights(obs: Observations, options: FitOptions, sigma: float) -> Float[Tenso
 
 def start(state: State, options: FitOptions, progress: Progress) -> State:
     """Globals on telling pixels, then every pixel (the paper's two steps), then the noise and the shape's scatter."""
+    if options.held is not None:
+        return each_pixel(state, progress)
+    state = each_pixel(start_globals(state, options, progress), progress)
+    state = with_noise_of_fit(state, options)
+    obs = state.obs
+    if options.prior == "auto" and obs.lights_known:
+        # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
+        vote = (state.found.cost <= quantile(state.found.cost, state.effort.trim)).nonzero()[:, 0]
+        shine = in_chunks(len(vote), lambda cut: lobe_pictures(obs, state.found.local[vote[cut]], state.shared))
+        spread = shape_spread(obs, taken(state.found.local, vote), state.shared, shine, state.sigma)
+        shape = max(state.priors.shape, 1.0 / spread)
+        state = rescored(replace(state, priors=replace(state.priors, shape=shape)))
+    return state
+
+
+def each_pixel(state: State, progress: Progress) -> State:
+    """Every pixel on its own, and lobes handed on."""
+    obs, effort = state.obs, state.effort
+    progress("pixels", 0, 3)
+    found = fit_locals(obs, state.priors, state.shared, effort, state.robust)
+    for i, radius in enumerate((2, 1)):
+        progress("pixels", i + 1, 3)
+        found = hand_on_lobes(obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius)
+    progress("pixels", 3, 3)
+    return replace(state, found=found)
+
+
+def start_globals(state: State, options: FitOptions, progress: Progress) -> State:
+    """Globals on telling pixels, from a grid or from where another fit has left them."""
     obs, effort = state.obs, state.effort
     index = informative_pixels(obs, state.body, options.globals_pixels)
 
@@ -268,8 +324,13 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
     part, priors = obs.take(index), state.priors.take(index)
 
     first = state.shared
-    starts = globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
-    state = replace(state, shared=globals_from(state, starts))
+
+    def trials(priors: Priors) -> list[Tensor]:
+        if options.given is not None:
+            return []
+        return globals_grid(part, priors, first, n_s, trim=effort.trim, best=effort.starts)
+
+    state = replace(state, shared=globals_from(state, trials(priors) or [first]))
     if options.prior == "auto":
         part, priors = state.obs.take(index), state.priors.take(index)
         found = fit_locals(part, priors, state.shared, effort, state.robust)
@@ -278,22 +339,8 @@ def start(state: State, options: FitOptions, progress: Progress) -> State:
         spread = shape_spread(part.take(good), found.local[good], state.shared, shine, state.sigma)
         state = replace(state, priors=replace(state.priors, shape=1.0 / spread))
         # Under the firmer prior another start may lead lower.
-        again = globals_grid(part, state.priors.take(index), first, n_s, trim=effort.trim, best=effort.starts)
+        again = trials(state.priors.take(index))
         state = replace(state, shared=globals_from(state, [state.shared, *again]))
-    progress("pixels", 0, 3)
-    found = fit_locals(obs, state.priors, state.shared, effort, state.robust)
-    for i, radius in enumerate((2, 1)):
-        progress("pixels", i + 1, 3)
-        found = hand_on_lobes(obs, state.priors, found, state.shared, state.mask, effort, state.robust, radius=radius)
-    progress("pixels", 3, 3)
-    state = with_noise_of_fit(replace(state, found=found), options)
-    if options.prior == "auto" and obs.lights_known:
-        # By the noise that is known only now: by the first, too large one, hardly any lobe may have counted as seen.
-        vote = (state.found.cost <= quantile(state.found.cost, effort.trim)).nonzero()[:, 0]
-        shine = in_chunks(len(vote), lambda cut: lobe_pictures(obs, state.found.local[vote[cut]], state.shared))
-        spread = shape_spread(obs, taken(state.found.local, vote), state.shared, shine, state.sigma)
-        shape = max(state.priors.shape, 1.0 / spread)
-        state = rescored(replace(state, priors=replace(state.priors, shape=shape)))
     return state
 
 
@@ -317,13 +364,13 @@ def with_noise(state: State, options: FitOptions, sigma: float) -> State:
 
 def refine(state: State, options: FitOptions, progress: Progress) -> State:
     """Everything jointly; then soft shadows where they pay; then the neighbourhood's say."""
-    if options.alpha_sd > 0:
+    if options.alpha_sd > 0 and options.held is None:
         # Only now: a handful of pixels would lead alphas astray before the lobe is known.
         free = state.free.clone()
         free[ALPHA:] = True
         state = replace(state, free=free)
     state = joint_step(state, "joint fit", progress)
-    if options.lobe != "single":
+    if options.lobe != "single" and options.held is None and not bool(state.free[SOFTNESS]):
         state = try_soft_edges(state, progress)
     if bool((state.priors.parallel > 0).any()):
         for i in range(2):
@@ -340,7 +387,12 @@ def refine(state: State, options: FitOptions, progress: Progress) -> State:
 
 def smooth_lobes(state: State, options: FitOptions, progress: Progress) -> State:
     """The lobes of the neighbourhood, at finer and finer scales; how smooth they are is learnt before it has a say."""
-    scales = scales_of(state) if options.prior == "auto" else []
+    scales: list[tuple[float, float]] = []
+    if options.held is not None:
+        scales = list(options.held.scales)
+    elif options.prior == "auto":
+        scales = scales_of(state)
+    state = replace(state, scales=tuple(scales))
     for i, (scale, spread) in enumerate(scales):
         prediction = predict(state, scale, spread)
         if prediction is None:

@@ -189,6 +189,8 @@ def fit_everything(
     report: Report,
 ) -> JointSolution:
     """Globals and all pixels jointly; pixels that the model cannot explain follow without a vote."""
+    if not bool(free.any()):
+        return follow_the_globals(obs, priors, found, shared, effort, robust)
     number = max(4, int(effort.trim_all * len(obs)))
     vote = found.cost.argsort()[:number].sort().values
     vote = vote[:: max(1, -(-len(vote) // effort.voters))]
@@ -206,6 +208,30 @@ def fit_everything(
         others = local_in_chunks(problem, taken(local, index), joint.shared, effort.polish, effort.chunk, index)
         local[index], settled[index] = others.local, others.converged
     return replace(joint, local=local, settled=settled)
+
+
+def follow_the_globals(
+    obs: Observations,
+    priors: Priors,
+    found: LocalFit,
+    shared: Float[Tensor, "G"],
+    effort: Effort,
+    robust: float | None,
+) -> JointSolution:
+    """All pixels under globals that are held."""
+    problem = build_problem(obs, priors, robust=robust)
+    ends = local_in_chunks(problem, found.local, shared, effort.polish, effort.chunk)
+    cost = float(ends.cost.sum())
+    return JointSolution(
+        local=ends.local,
+        shared=shared,
+        cost=cost,
+        information=shared.new_zeros(len(shared), len(shared)),
+        iterations=0,
+        converged=True,
+        settled=ends.converged,
+        history=(cost,),
+    )
 
 
 def hand_on_lobes(

@@ -28,3 +28,5 @@ class State:
     """Robust whole diffuse root, from before any lobe was fitted."""
     found: LocalFit
     joint: JointSolution | None = None
+    scales: tuple[tuple[float, float], ...] = ()
+    """Neighbourhoods that had a say in the lobes: width and spread."""

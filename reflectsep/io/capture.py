@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from reflectsep.data import Capture, Light, Sweep
+from reflectsep.data import Capture, Light, Region, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io import manifest
 from reflectsep.io.files import inside, read_json, sha256, write_json
@@ -17,7 +17,11 @@ MANIFEST = "capture.json"
 
 
 def load_capture(
-    path: Path | str, *, basis: Sequence[str] | None = None, lights_file: Path | str | None = None
+    path: Path | str,
+    *,
+    basis: Sequence[str] | None = None,
+    lights_file: Path | str | None = None,
+    region: Sequence[int] | None = None,
 ) -> Capture:
     """Load a capture: its manifest is checked and every file it names is there; no picture is read.
 
@@ -27,6 +31,8 @@ def load_capture(
         basis: names of the three basis lights, in place of the manifest's or of those found best conditioned.
         lights_file: list of lights: in a plain folder instead of the one found there; with a manifest its directions
             and intensities replace the manifest's, for the lights that it names.
+        region: x, y, width and height in pixels, from the top left: the only part of every picture and frame that is
+            kept when they are read; None: all of it.
 
     Raises:
         CaptureError: no capture there, a manifest that is not as the format says, or a missing file.
@@ -38,7 +44,7 @@ def load_capture(
     if not path.is_dir():
         raise CaptureError(f"{path}: {'a file, a folder was expected' if path.exists() else 'no such folder'}")
     if not (path / MANIFEST).is_file():
-        return load_plain(path, basis=basis, lights_file=lights_file)
+        return with_region(load_plain(path, basis=basis, lights_file=lights_file), region)
     document = read_json(path / MANIFEST)
     if basis is not None and isinstance(document, dict):
         document = {**document, "basis": [str(name) for name in basis]}
@@ -48,7 +54,25 @@ def load_capture(
     for file, place, _ in files(capture):
         if not inside(path, file).is_file():
             raise CaptureError(f"{path / file}: no such file, but {MANIFEST} names it ({place})")
-    return capture
+    return with_region(capture, region)
+
+
+def with_region(capture: Capture, region: Sequence[int] | None) -> Capture:
+    """The capture of which only a part is kept.
+
+    Raises:
+        CaptureError: a region that has no pixels, or is not inside the pictures, where their size is known.
+    """
+    if region is None:
+        return replace(capture, region=None)
+    x, y, width, height = (int(value) for value in region)
+    part = Region(x=x, y=y, width=width, height=height)
+    size = capture.size or (x + width, y + height)  # else it is seen when the first picture is read
+    if not part.inside(size):
+        raise CaptureError(
+            f"{capture.folder}: region={part} (x, y, width, height) is not inside its pictures of {size[0]}x{size[1]}"
+        )
+    return replace(capture, region=part)
 
 
 def files(capture: Capture) -> Iterator[tuple[str, str, str | None]]:

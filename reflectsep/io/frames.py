@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from reflectsep.data import Capture, Frame, FrameStream, Sweep
+from reflectsep.data import Capture, Frame, FrameStream, Region, Sweep
 from reflectsep.errors import CaptureError, MissingExtraError
 from reflectsep.io.ahead import Lead, in_order, lead_for
 from reflectsep.io.files import inside
 from reflectsep.io.manifest import frame_file
 from reflectsep.io.pictures import developed, read_picture, require_checksum
-from reflectsep.io.stack import picture_size, require_channels, require_size
+from reflectsep.io.stack import picture_size, require_channels, require_size, windowed
 
 BYTES_A_VALUE = 5
 """A float and whether it is clipped."""
@@ -44,9 +44,10 @@ def open_sweep(capture: Capture, sweep: Sweep) -> FrameStream:
     channels = int(read_picture(first)[0].shape[0])
     size = picture_size(capture)
     if sweep.video is None:
-        return FileFrames(sweep=sweep, folder=capture.folder, size=size, channels=channels)
+        return FileFrames(sweep=sweep, folder=capture.folder, size=size, channels=channels, region=capture.region)
     _av(capture.folder / sweep.video)
-    return VideoFrames(sweep=sweep, path=inside(capture.folder, sweep.video), size=size, channels=channels)
+    path = inside(capture.folder, sweep.video)
+    return VideoFrames(sweep=sweep, path=path, size=size, channels=channels, region=capture.region)
 
 
 class Shown:
@@ -69,8 +70,10 @@ class FileFrames(Shown):
     sweep: Sweep
     folder: Path
     size: tuple[int, int]
-    """(width, height)."""
+    """(width, height) of the files."""
     channels: int
+    region: Region | None = None
+    """What is kept of a frame."""
     lead: Lead | None = None
     """How far decoding runs ahead; None: as far as cores and memory allow."""
 
@@ -88,6 +91,7 @@ class FileFrames(Shown):
         values, saturated = read_picture(path, recorded)
         require_size(path, values, self.size)
         require_channels(path, values, self.channels)
+        values, saturated = windowed(path, self.region, values, saturated)
         return Frame(index=index, values=values, saturated=saturated)
 
 
@@ -98,8 +102,10 @@ class VideoFrames(Shown):
     sweep: Sweep
     path: Path
     size: tuple[int, int]
-    """(width, height)."""
+    """(width, height) of the files."""
     channels: int
+    region: Region | None = None
+    """What is kept of a frame."""
 
     def __len__(self) -> int:
         return self.sweep.count
@@ -120,6 +126,7 @@ class VideoFrames(Shown):
             values, saturated = developed(place, pixels, largest)
             require_size(place, values, self.size)
             require_channels(place, values, self.channels)
+            values, saturated = windowed(place, self.region, values, saturated)
             yield Frame(index=index, values=values, saturated=saturated)
         expected = self.sweep.video_start + len(present)
         if number + 1 < expected:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.data import Capture, Picture, Sweep
+from reflectsep.data import Capture, Picture, Region, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io.capture import checksum
 from reflectsep.io.files import inside
@@ -130,17 +130,29 @@ def read_mask(capture: Capture) -> Bool[Tensor, "height width"]:
         CaptureError: it cannot be read, has another size, or is empty.
     """
     if capture.mask is None:
-        width, height = picture_size(capture)
+        width, height = kept_size(capture)
         return torch.ones((height, width), dtype=torch.bool)
     values, _ = _read(capture, capture.mask, None)
     mask = (values > 0.5).any(dim=0)
     if not mask.any():
-        raise CaptureError(f"{capture.folder / capture.mask}: the mask is empty: no pixel of it is above one half")
+        where = "it" if capture.region is None else f"its region {capture.region}"
+        raise CaptureError(f"{capture.folder / capture.mask}: the mask is empty: no pixel of {where} is above one half")
     return mask
 
 
+def kept_size(capture: Capture) -> tuple[int, int]:
+    """(width, height) of what is kept of a picture: its region, or all of it.
+
+    Raises:
+        CaptureError: the picture cannot be read.
+    """
+    if capture.region is not None:
+        return capture.region.width, capture.region.height
+    return picture_size(capture)
+
+
 def picture_size(capture: Capture) -> tuple[int, int]:
-    """(width, height): the manifest's, or that of the first basis picture.
+    """(width, height) of the files: the manifest's, or that of the first basis picture.
 
     Raises:
         CaptureError: the picture cannot be read.
@@ -150,6 +162,23 @@ def picture_size(capture: Capture) -> tuple[int, int]:
     path = inside(capture.folder, capture.full(capture.basis[0]).file)
     values, _ = read_picture(path)
     return (values.shape[2], values.shape[1])
+
+
+def windowed(path: Path | str, region: Region | None, *pictures: Tensor) -> tuple[Tensor, ...]:
+    """What is to be kept of pictures (..., height, width).
+
+    Raises:
+        CaptureError: the region is not inside of them.
+    """
+    if region is None:
+        return pictures
+    for picture in pictures:
+        height, width = picture.shape[-2:]
+        if not region.inside((width, height)):
+            raise CaptureError(
+                f"{path}: {width}x{height}, but region={region} (x, y, width, height) is to be kept of it"
+            )
+    return tuple(region.of(picture) for picture in pictures)
 
 
 def require_size(path: Path | str, values: Tensor, size: tuple[int, int]) -> None:
@@ -171,6 +200,7 @@ def _read(capture: Capture, file: str, like: Tensor | None) -> tuple[Tensor, Ten
     values, saturated = read_picture(path, checksum(capture, file))
     if capture.size is not None:
         require_size(path, values, capture.size)
+    values, saturated = windowed(path, capture.region, values, saturated)
     if like is not None:
         if capture.size is None and values.shape[1:] != like.shape[1:]:
             (height, width), (tall, wide) = values.shape[1:], like.shape[1:]

@@ -96,6 +96,14 @@ def global_parameters(separation: Separation, stack: PhotometricStack | None) ->
         for name, value, what in found
     ]
     parts = [html.table(["global", "value", "standard deviation", "what it is"], rows)]
+    taken = separation.document.get("globals_from", {})
+    if taken:
+        how = (
+            "They are held as they are, and their uncertainty with them"
+            if taken.get("use") == "held"
+            else "The fit started from those"
+        )
+        parts.append(html.text(f"{how}, of the result {taken.get('result')}."))
     parts.append(html.text("All have no unit but a, which is in the n_s-th root of the capture's units."))
     trade = None if stack is None else cost_valley(separation, stack)
     if trade is not None:

@@ -14,7 +14,7 @@ from reflectsep.room import empty, stacked
 from reflectsep.scatter.exponent import GRID, UNKNOWN_SD, Exponent, Samples, complete, solve_exponent
 from reflectsep.scatter.frames import name_of
 from reflectsep.scatter.local import box_sum
-from reflectsep.scatter.options import ScatterOptions
+from reflectsep.scatter.options import HeldSweeps, ScatterOptions
 from reflectsep.scatter.passage import Passage
 from reflectsep.scatter.width import lit_frames
 from reflectsep.scatter.width_fit import fitted_width
@@ -42,6 +42,8 @@ class Gains:
 
 def exponents(options: ScatterOptions) -> tuple[float, ...]:
     """Values of n_d for which the first pass sums roots."""
+    if options.held is not None:
+        return (options.held.n_d,)
     return GRID if options.n_d is None else (options.n_d,)
 
 
@@ -85,6 +87,8 @@ def solve_gains(
     options: ScatterOptions,
 ) -> Gains:
     """Solve Eq. 25 over the sweeps that allow it; take C from the slab's geometry for the others."""
+    if options.held is not None:
+        return _held(options.held, passages)
     of = [_samples(stack, k, p, m) for k, p, m in zip(lights, passages, samples, strict=True)]
     usable = [i for i, s in enumerate(of) if s is not None]
     frames = [options.lit_frames or _lit_frames(p, stack.mask) for p in passages]
@@ -112,6 +116,19 @@ def solve_gains(
         gains_sd=tuple(gains_sd),
         lit_frames=tuple(frames),
         warnings=tuple(warnings),
+    )
+
+
+def _held(held: HeldSweeps, passages: list[Passage]) -> Gains:
+    reports = [held.of(passage.sweep.light, passage.sweep.direction) for passage in passages]
+    return Gains(
+        n_d=held.n_d,
+        n_d_sd=held.n_d_sd,
+        source=held.n_d_source,
+        gains=tuple(report.gain for report in reports),
+        gains_sd=tuple(report.gain_sd for report in reports),
+        lit_frames=tuple(report.lit_frames for report in reports),
+        warnings=(),
     )
 
 

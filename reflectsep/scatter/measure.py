@@ -144,6 +144,8 @@ def _prepare(
     progress: Progress,
 ) -> list[_Prepared]:
     steps_px = _steps_px(passages, stack.mask)
+    if options.held is not None:
+        steps_px = [options.held.of(p.sweep.light, p.sweep.direction).step_px for p in passages]
     prepared = []
     for i, (stream, k, passage) in enumerate(zip(sweeps, lights, passages, strict=True)):
         reached, coverage = _coverage(stack.images[k], passage, stack.mask)
@@ -176,6 +178,7 @@ def _prepare(
             lit_frames=lit_frames,
             speed_deviation=speed_deviation(passage, stack.images[k], stack.mask),
             coverage=coverage,
+            step_px=steps_px[i],
         )
         elsewhere = torch.zeros_like(stack.mask)
         evidence = Evidence(

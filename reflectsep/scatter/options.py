@@ -6,10 +6,33 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from reflectsep.data import SweepReport
 from reflectsep.errors import SettingsError
 
 HoleFilling = Literal["profile", "maximum", "interpolation", "orthogonal", "time"]
 LitBand = Literal["threshold", "profile"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeldSweeps:
+    """Exponent and gains that the sweeps of another part of the same object, taken alike, have given."""
+
+    n_d: float
+    n_d_sd: float
+    n_d_source: Literal["estimated", "fixed", "unidentifiable"]
+    sweeps: tuple[SweepReport, ...]
+
+    def of(self, light: str, direction: str) -> SweepReport:
+        """What there is of a sweep.
+
+        Raises:
+            SettingsError: nothing.
+        """
+        for report in self.sweeps:
+            if (report.light, report.direction) == (light, direction):
+                return report
+        known = ", ".join(f"{report.light} along {report.direction}" for report in self.sweeps) or "none"
+        raise SettingsError(f"sweep of {light} along {direction}: no gain of it is given; given are {known}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +55,8 @@ class ScatterOptions:
     """Filling `profile` only: light that left farther than this from where it entered counts as scattering."""
     lit_frames: float | None = None
     """Frames in which a patch is lit (slab width over step), where the rig knows it; None: from the profiles."""
+    held: HeldSweeps | None = None
+    """n_d, gains, lit frames and steps that are not to be estimated."""
     reach_frames: int = 9
     """Frames on either side of the lit interval from which a pixel's profile is fitted."""
 
