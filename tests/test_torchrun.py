@@ -34,12 +34,16 @@ def capture(tmp_path_factory):
 
 def test_two_processes_give_the_result_of_one_bit_for_bit(tmp_path, capture):
     subprocess.run([sys.executable, *fit_words(capture, tmp_path / "one")], env=ENVIRONMENT, check=True)
-    words = [*TORCHRUN, *fit_words(capture, tmp_path / "two")]
+    words = [*TORCHRUN, *fit_words(capture, tmp_path / "two"), "--progress"]
     shared = subprocess.run(words, env=ENVIRONMENT, check=True, capture_output=True, text=True, timeout=200)
     assert shared.stdout.count("Wu & Tang") == 1
     one, two = load(tmp_path / "one"), load(tmp_path / "two")
-    for name in ("a", "n_s", "B", "d", "s", "specular", "flags", "d_sd"):
+    for name in ("a", "n_s", "B", "d", "s", "specular", "scattering", "s_sd", "flags", "d_sd"):
         assert torch.equal(getattr(one, name), getattr(two, name)), name
+    assert one.document["sweeps"] == two.document["sweeps"]
+    for step in ("passage", "scattering"):  # the first process goes through the first and the third sweep
+        walked = [line.split()[1] for line in shared.stderr.splitlines() if line.startswith("sweep ") and step in line]
+        assert sorted(set(walked)) == ["L1", "L3"]
     assert one.document["alignment"] == two.document["alignment"]
 
 

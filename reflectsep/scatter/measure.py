@@ -32,6 +32,7 @@ from reflectsep.scatter.kernel import Slab
 from reflectsep.scatter.local import box_sum, quantile
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage, speed_deviation, watch
+from reflectsep.scatter.shared import summed, watched
 
 LEAST_COVERAGE = 0.9
 DOUBTFUL = 0.6
@@ -92,15 +93,22 @@ def _measured(
 ) -> Scattering:
     chosen = choose_samples(stack, lights)
     grid = torch.tensor(exponents(options), dtype=torch.float64)
-    passages = [
-        watch(stream, stack.images[k], stack.mask, exponents=grid, samples=c, progress=progress)
-        for stream, k, c in zip(sweeps, lights, chosen, strict=True)
-    ]
+
+    def passage(i: int) -> Passage:
+        full = stack.images[lights[i]]
+        return watch(sweeps[i], full, stack.mask, exponents=grid, samples=chosen[i], progress=progress)
+
+    passages = watched(sweeps, passage)
     gains = solve_gains(stack, lights, passages, chosen, options)
     prepared = _prepare(stack, sweeps, lights, passages, gains, options, progress)
     warnings = list(gains.warnings) + _warn(prepared, options)
     normals = crude_normals(stack)
-    sums = [_root_sum(p, prepared, gains.n_d, options, _stretch(stack, normals, p)).div_(p.gain) for p in prepared]
+
+    def root_sum(i: int) -> Picture:
+        p = prepared[i]
+        return _root_sum(p, prepared, gains.n_d, options, _stretch(stack, normals, p)).div_(p.gain)
+
+    sums = summed([p.clipped_elsewhere for p in prepared], root_sum)
     noise = [_root_sd(p, gains.n_d) for p in prepared]
     root, root_sd, measured = _combine(stack, lights, sums, noise)
     return Scattering(

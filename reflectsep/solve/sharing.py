@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from reflectsep.errors import ReflectsepError, SaidElsewhereError, WorkerError
+from reflectsep.room import empty
 from reflectsep.room import rows as rows_of
 
 SHARES = 4
@@ -161,6 +162,54 @@ def by_items(count: int, work: Callable[[int], Any]) -> list[Any]:
     return [json.loads(entry) for entry in text.splitlines()]
 
 
+def by_turns(count: int, work: Callable[[int], Mapping[str, Tensor]]) -> list[dict[str, Tensor]]:
+    """What `work` gives for every item 0 .. count - 1, in their order; item i is worked out by process i modulo all.
+
+    For few and large items: each tensor goes from the process that made it straight into its place in the others.
+
+    Args:
+        count: items in all.
+        work: from an item to tensors by name, of any shapes, on the processor.
+
+    Raises:
+        WorkerError: another process of the run is gone.
+    """
+    crew = workers()
+    token = _workers.set(_ALONE)
+    try:
+        own = {i: dict(work(i)) for i in range(count) if i % crew.count == crew.rank}
+    finally:
+        _workers.reset(token)
+    if crew.count == 1:
+        return [own[i] for i in range(count)]
+    try:
+        return [_handed_out(own.pop(i, None), i % crew.count) for i in range(count)]
+    except RuntimeError as error:
+        raise _gone(error) from error
+
+
+def _handed_out(own: dict[str, Tensor] | None, source: int) -> dict[str, Tensor]:
+    """An item's tensors on all processes; `own` is None on those that did not make them."""
+    import torch.distributed as dist
+
+    made = own or {}
+    header = json.dumps([[name, str(part.dtype).split(".")[-1], list(part.shape)] for name, part in made.items()])
+    text = torch.frombuffer(bytearray(header.encode()), dtype=torch.uint8)
+    length = torch.tensor([len(text)])
+    dist.broadcast(length, source)
+    if own is None:
+        text = torch.empty(int(length), dtype=torch.uint8)
+    dist.broadcast(text, source)
+    result: dict[str, Tensor] = {}
+    for name, kind, shape in json.loads(text.numpy().tobytes()):
+        dtype = getattr(torch, kind)
+        part = empty(*shape, dtype=dtype) if own is None else own[name].contiguous()
+        # One byte each, but no kind that processes exchange.
+        dist.broadcast(part.view(torch.uint8) if dtype == torch.bool else part, source)
+        result[name] = part
+    return result
+
+
 def _gather(own: list[Tensor], crew: Workers, chunks: int) -> Tensor:
     """Every chunk's tensor, in order, on all processes."""
     import torch.distributed as dist
@@ -179,7 +228,7 @@ def _gather(own: list[Tensor], crew: Workers, chunks: int) -> Tensor:
         gathered = [torch.empty_like(padded) for _ in totals]
         dist.all_gather(gathered, padded)
     except RuntimeError as error:
-        raise WorkerError(f"another process of this run is gone or does not answer ({_reason(error)})") from error
+        raise _gone(error) from error
     result = mine.new_empty(int(rows.sum()), *mine.shape[1:])
     starts = [0, *rows.cumsum(0).tolist()]
     for rank, part in enumerate(gathered):
@@ -189,6 +238,11 @@ def _gather(own: list[Tensor], crew: Workers, chunks: int) -> Tensor:
             result[starts[i] : starts[i + 1]] = part[at : at + length]
             at += length
     return result.to(kind)
+
+
+def _gone(error: RuntimeError) -> WorkerError:
+    """What is said when processes cannot exchange anything any more."""
+    return WorkerError(f"another process of this run is gone or does not answer ({_reason(error)})")
 
 
 def _reason(error: RuntimeError) -> str:

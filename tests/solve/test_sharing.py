@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reflectsep.errors import SaidElsewhereError, WorkerError
-from reflectsep.solve.sharing import ALIGNED, SHARES, by_chunks, by_items, cuts_of, shared_work, workers
+from reflectsep.solve.sharing import ALIGNED, SHARES, by_chunks, by_items, by_turns, cuts_of, shared_work, workers
 
 WORKER = """
 import json, os, sys
@@ -154,3 +154,59 @@ def test_an_error_of_all_is_said_by_one(tmp_path):
     assert all(process.returncode != 0 for process in ended)
     quiet = [SaidElsewhereError.__name__ in process.stderr for process in ended]
     assert sorted(quiet) == [False, True]
+
+
+TURNS = """
+import sys
+import torch
+from reflectsep.solve.sharing import by_turns, shared_work, workers
+
+def work(i):
+    assert workers().count == 1  # what is nested is not shared again
+    made.append(i)
+    values = torch.arange(i + 1.0, dtype=torch.float64).sin()
+    return {"a": values, "flags": values > 0, "n": torch.tensor(i), "none": torch.empty(0, i), "T": torch.rand(2, 3).T}
+
+with shared_work() as crew:
+    made = []
+    torch.manual_seed(crew.rank)
+    found = by_turns(5, work)
+    torch.save({"found": found, "made": made}, sys.argv[1])
+    by_turns(1, work)
+    if sys.argv[2] == "die" and crew.rank == 1:
+        import os
+        os._exit(9)
+    try:
+        by_turns(3, work)
+    except Exception as error:
+        print(type(error).__name__, error)
+        raise
+"""
+
+
+def test_large_items_come_from_the_process_whose_turn_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "WORKER", TURNS)
+    ended = run_two(tmp_path, "go on")
+    assert [process.returncode for process in ended] == [0, 0], [process.stderr for process in ended]
+    first, second = (torch.load(tmp_path / f"{rank}.pt") for rank in range(2))
+    assert (first["made"], second["made"]) == ([0, 2, 4], [1, 3])
+    for i, (one, two) in enumerate(zip(first["found"], second["found"], strict=True)):
+        assert list(one) == list(two) == ["a", "flags", "n", "none", "T"]
+        for name in one:
+            assert torch.equal(one[name], two[name])
+            assert one[name].dtype == two[name].dtype
+        assert torch.equal(one["a"], torch.arange(i + 1.0, dtype=torch.float64).sin())
+        assert torch.equal(one["flags"], one["a"] > 0)
+        assert (int(one["n"]), one["none"].shape, one["T"].shape) == (i, (0, i), (3, 2))
+
+
+def test_a_process_that_dies_at_its_turn_is_an_error_of_the_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "WORKER", TURNS)
+    first, second = run_two(tmp_path, "die")
+    assert second.returncode == 9
+    assert first.returncode != 0
+    assert first.stdout.startswith("WorkerError another process of this run is gone or does not answer")
+
+
+def test_alone_items_are_all_its_own():
+    assert [each["n"] for each in by_turns(3, lambda i: {"n": i})] == [0, 1, 2]
