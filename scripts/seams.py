@@ -4,7 +4,8 @@
 
 Three sets of tiles: `own` (every tile its own globals, C and priors), `window` (held, those of one fit of a window
 about the middle), `whole` (held, those of the result `whole`). All move as the whole does. Printed are RMS differences
-over the RMS on the whole object, of off-specular, whole diffuse and scattered light, and of lights halfway between the basis lights relit:
+over the RMS on the whole object, of off-specular, whole diffuse and scattered light, and of lights halfway between the
+basis lights relit:
 
     cut    hard cuts against the whole, within 3 pixels of a cut
     away   the same farther than an overlap from any cut
