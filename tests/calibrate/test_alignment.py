@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 from reflectsep.calibrate import across_lights
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.aligned_stream import aligned_stream
-from reflectsep.calibrate.alignment import align, covered
+from reflectsep.calibrate.alignment import Alignment, align, covered
 from reflectsep.calibrate.exposure import developed_stream, response_of
 from reflectsep.calibrate.motion import Motion, displacement, shifted
 from reflectsep.calibrate.stack import calibrate_stack, develop_pictures
@@ -180,3 +180,26 @@ def test_document_names_the_reference_and_every_motion(drifted, found):
     assert list(document["pictures"]) == list(drifted.names)
     assert [(s["light"], s["direction"]) for s in document["sweeps"]] == [("L1", "x"), ("L2", "x"), ("L3", "x")]
     assert json.loads(json.dumps(document)) == document
+
+
+def test_motions_of_a_window_are_those_of_the_whole(found):
+    part = found.in_window(7, 4, (20, 16))
+    assert part.size == (20, 16)
+    assert any(motion.applied for motion in part.sweeps)
+    here = torch.tensor([3.0, 5.0, 1.0], dtype=torch.float64)
+    there = here + torch.tensor([7.0, 4.0, 0.0], dtype=torch.float64)
+    pairs = [(found.pictures[name], motion) for name, motion in part.pictures.items()]
+    for whole, motion in (*pairs, *zip(found.sweeps, part.sweeps, strict=True)):
+        moved, expected = motion.at(0.5) @ here, whole.at(0.5) @ there
+        torch.testing.assert_close(moved[:2] / moved[2], expected[:2] / expected[2] - there[:2] + here[:2])
+    back = part.in_window(-7, -4, found.size)
+    for one, two in zip(back.sweeps, found.sweeps, strict=True):
+        torch.testing.assert_close(one.matrix, two.matrix)
+
+
+def test_a_document_has_the_motions_of_every_exposure(drifted, found):
+    own = Motion(matrix=shifted(0.7, 0.0), applied=True, reason="told")
+    several = replace(found, exposures=tuple((own,) for _ in found.sweeps))
+    again = Alignment.from_document(json.loads(json.dumps(several.document(drifted))))
+    assert torch.equal(again.exposures[0][0].matrix, own.matrix)
+    assert len(again.exposures) == len(found.sweeps)

@@ -1,5 +1,7 @@
 """Flat fields."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from reflectsep.calibrate.develop import linear_response
 from reflectsep.calibrate.exposure import developed_stream
 from reflectsep.calibrate.flat import flat_of
 from reflectsep.calibrate.stack import calibrate_stack
-from reflectsep.data import Frame, Picture, Sweep
+from reflectsep.data import Frame, Picture, Region, Sweep
 from reflectsep.errors import CaptureError
 from reflectsep.io.pictures import write_picture
 
@@ -86,3 +88,13 @@ def test_a_flat_with_a_black_corner_is_refused(folder):
     folder.images.append(Picture(kind="flat", file="flat.exr"))
     with pytest.raises(CaptureError, match=r"flat\.exr: a flat field of 0\.0% of its mean somewhere on the object"):
         calibrate_stack(folder.load())
+
+
+def test_the_flat_of_a_window_is_a_part_of_that_of_the_whole(folder):
+    capture = uneven(folder, light="L2").load()
+    whole = flat_of(capture, "L2", linear_response)
+    region = Region(x=5, y=2, width=10, height=12)
+    part = flat_of(replace(capture, region=region), "L2", linear_response)
+    assert whole is not None
+    assert part is not None
+    assert torch.equal(part, whole[:, 2:14, 5:15])

@@ -11,6 +11,7 @@ from reflectsep.io.ahead import NO_LEAD, Lead
 from reflectsep.io.capture import load_capture, write_manifest
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.pictures import write_picture
+from reflectsep.io.stack import read_full, read_mask
 
 needs_av = pytest.mark.skipif(importlib.util.find_spec("av") is None, reason="PyAV is an extra")
 
@@ -247,3 +248,15 @@ def test_video_without_pyav(tiny, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"v\.mkv: .*reflectsep\[video\]"):
         opened(tiny)
+
+
+def test_only_the_window_of_a_frame_is_kept(tiny):
+    capture = load_capture(tiny.folder, region=[1, 0, 3, 2])
+    for frame in open_sweep(capture, capture.sweeps[0]):
+        assert torch.equal(frame.values, tiny.picture(frame.index / 8)[:, 0:2, 1:4])
+        assert frame.saturated is not None
+        assert frame.saturated.shape == (1, 2, 3)
+        assert frame.values.untyped_storage().nbytes() == 4 * 6  # the rest is let go
+    raw = read_full(capture)
+    assert torch.equal(raw.values, read_full(load_capture(tiny.folder)).values[..., 0:2, 1:4])
+    assert read_mask(capture).shape == (2, 3)

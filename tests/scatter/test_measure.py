@@ -5,8 +5,11 @@ import torch
 
 from reflectsep.errors import SettingsError, SweepError
 from reflectsep.flags import Flag
-from reflectsep.scatter import ScatterOptions, measure_scattering
+from reflectsep.scatter import ScatterOptions, gains, measure_scattering
 from reflectsep.scatter.filling import FILLINGS
+from reflectsep.scatter.options import HeldSweeps
+from reflectsep.scatter.passage import watch
+from reflectsep.scatter.shared import passage_of, tensors_of
 
 
 def has(result, flag):
@@ -298,3 +301,38 @@ def test_empty_mask(body):
 def test_impossible_settings(name, value):
     with pytest.raises(SettingsError, match=f"scatter.{name}={value}"):
         ScatterOptions(**{name: value})
+
+
+def test_held_sweeps_are_not_solved_again_and_give_the_same_bit_for_bit(body, monkeypatch):
+    b = body()
+    free = measure_scattering(b.stack(), b.streams())
+    told = HeldSweeps(n_d=free.n_d, n_d_sd=free.n_d_sd, n_d_source="estimated", sweeps=free.sweeps)
+    for name in ("solve_exponent", "_lit_frames", "_samples"):
+        monkeypatch.setattr(gains, name, None)
+    held = measure_scattering(b.stack(), b.streams(), options=ScatterOptions(held=told))
+    assert torch.equal(held.root, free.root)
+    assert (held.n_d, held.n_d_sd, held.sweeps) == (free.n_d, free.n_d_sd, free.sweeps)
+    # C divides the sum of the frames.
+    doubled = tuple(dataclasses.replace(r, gain=2 * r.gain) for r in free.sweeps)
+    half = measure_scattering(
+        b.stack(), b.streams(), options=ScatterOptions(held=dataclasses.replace(told, sweeps=doubled))
+    )
+    assert float(half.root.sum() / free.root.sum()) == pytest.approx(0.5, rel=0.15)
+    with pytest.raises(SettingsError, match=r"sweep of L\d along x: no gain of it is given; given are none"):
+        measure_scattering(b.stack(), b.streams(), options=ScatterOptions(held=dataclasses.replace(told, sweeps=())))
+
+
+def test_a_passage_goes_from_one_process_to_another_as_it_is(body):
+    b = body()
+    stream, full, mask = b.streams()[0], b.stack().images[0], b.stack().mask
+    grid, some = torch.tensor([1.0, 1.3], dtype=torch.float64), mask.expand_as(full)
+    there = watch(stream, full, mask, exponents=grid, samples=some, progress=lambda *_: None)
+    back = passage_of(stream, tensors_of(there))
+    for one, two in ((there, back), (there.kept, back.kept)):
+        for field in dataclasses.fields(one):
+            first, second = getattr(one, field.name), getattr(two, field.name)
+            if isinstance(first, torch.Tensor):
+                assert torch.equal(first, second), field.name
+            elif field.name != "kept":
+                assert first == second, field.name
+                assert type(first) is type(second), field.name
