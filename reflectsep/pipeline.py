@@ -40,6 +40,8 @@ from reflectsep.workload import Counts, reading, solving
 
 __all__ = ["fit", "load", "load_capture"]
 
+SQUARE_PX = 24
+"""Side of the squares in which a share of the object is fitted: windows of neighbours reach 9 pixels."""
 PREVIEW_PIXELS = 1 << 22
 """A preview is a quick look: larger pictures are halved."""
 
@@ -135,6 +137,7 @@ def separated(
     held = handed.sweeps if handed is not None and handed.held else None
     scattering = measure(capture, stack, settings, scatter, progress, alignment, held)
     clock.lap("scattering")
+    stack = strewn(stack, settings.share)
     fitted = fit_reflectance(stack, scattering, options, progress=progress)
     clock.lap("fit")
     document = describe(
@@ -158,6 +161,25 @@ def separated(
         document["globals_from"] = handed.document()
     document |= learnt_document(fitted.learnt, stack, scattering, capture.exposure_s)
     return separate(stack, scattering, fitted, document)
+
+
+def strewn(stack: PhotometricStack, share: float) -> PhotometricStack:
+    """The stack with only a share of its object, in squares of `SQUARE_PX` that lie evenly over it.
+
+    Whole squares, for what is taken from the neighbourhood. Which: those where a plane of two irrational slopes, modulo
+    1, is below `share` (additive recurrence; Roberts 2018), so that neither rows nor columns are preferred.
+
+    Raises:
+        FitError: no pixel of the object is in them.
+    """
+    if share >= 1.0:
+        return stack
+    rows, columns = (torch.arange(length) // SQUARE_PX for length in stack.mask.shape)
+    place = (0.7548776662 * rows[:, None].double() + 0.5698402910 * columns.double()) % 1.0
+    mask = stack.mask & (place < share)
+    if not bool(mask.any()):
+        raise FitError(f"fit.share={share:g}: no pixel of the object is in the squares that are to be fitted")
+    return dataclasses.replace(stack, mask=mask)
 
 
 def counts_before(capture: Capture) -> Counts:
@@ -246,7 +268,7 @@ def fit_options(settings: FitSettings) -> FitOptions:
         built = f"torch {torch.__version__} is built {'for' if torch.version.cuda else 'without'} CUDA"
         raise SettingsError(f"{settings.key}device=cuda: no CUDA device is to be had ({built}); expected cpu")
     chosen = dataclasses.asdict(settings)
-    del chosen["globals_from"]
+    del chosen["globals_from"], chosen["share"]
     return FitOptions(**chosen)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.config import FitJob, FitSettings
-from reflectsep.data import Capture, Region
+from reflectsep.data import Region
 from reflectsep.errors import ResultError, SettingsError
 from reflectsep.handed import read_handed
 from reflectsep.io.capture import load_capture
@@ -32,6 +32,8 @@ from reflectsep.solve.sharing import workers
 from reflectsep.summary import summary
 
 Cut = Literal["feathered", "hard"]
+LEAST_SHARE = 0.02
+"""Of the object that gives the globals."""
 LEAST_OVERLAP_PX = 8
 """Windows of neighbours and filled holes reach about as far."""
 GLOBALS = ("a", "n_s", "n_d", "softness", "crest")
@@ -218,15 +220,6 @@ def added(timings: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {stage: round(sum(each.get(stage, 0.0) for each in timings), 3) for stage in stages}
 
 
-def first_region(capture: Capture, like: Region) -> Region:
-    """A window of the size of `like` about the middle of the object, inside the pictures."""
-    width, height = picture_size(capture)
-    rows, columns = read_mask(capture).nonzero().double().mean(0).tolist()
-    x = min(max(round(columns - like.width / 2), 0), width - like.width)
-    y = min(max(round(rows - like.height / 2), 0), height - like.height)
-    return Region(x=x, y=y, width=like.width, height=like.height)
-
-
 @dataclass(frozen=True, kw_only=True)
 class TilesJob:
     """A capture that is fitted in tiles."""
@@ -241,7 +234,8 @@ class TilesJob:
 def run_tiles(job: TilesJob, progress: Progress = silent) -> str:
     """Fit a capture in tiles, and put them together; tiles that are there already are taken as they are.
 
-    Globals come from `fit.globals_from`, or from a first fit of a window about the middle of the object.
+    Globals come from `fit.globals_from`, or from a first fit of as much as a tile's share of the object, strewn over
+    all of it.
 
     Raises:
         SettingsError: no tile of that number, or tiles that cannot be.
@@ -257,9 +251,9 @@ def run_tiles(job: TilesJob, progress: Progress = silent) -> str:
     beside = Path(f"{whole.out}.tiles")
     said, settings = [], whole.fit
     if settings.globals_from is None:
-        first = replace(whole, region=first_region(capture, regions[0]).plain(), out=str(beside / "first"))
-        first = replace(first, overwrite=whole.overwrite and job.only is None)
-        said += _fitted(first, progress)
+        share = replace(settings, share=max(1.0 / len(regions), LEAST_SHARE))
+        first = replace(whole, fit=share, out=str(beside / "first"))
+        said += _fitted(replace(first, overwrite=whole.overwrite and job.only is None), progress)
         settings = replace(settings, globals_from=str(beside / "first"), globals="held")
     names = []
     on_object = read_mask(capture)

@@ -2,10 +2,10 @@
 
     python scripts/seams.py capture=captures/wax whole=results/wax out=seams [columns=2] [rows=2] [overlap_px=24]
 
-Three sets of tiles: `own` (every tile its own globals, C and priors), `window` (held, those of one fit of a window
-about the middle), `whole` (held, those of the result `whole`). All move as the whole does. Printed are RMS differences
-over the RMS on the whole object, of off-specular, whole diffuse and scattered light, and of lights halfway between the
-basis lights relit:
+Three sets of tiles: `own` (every tile its own globals, C and priors), `strewn` (held, those of a fit of squares
+that are strewn over the object, as much of it as a tile), `whole` (held, those of the result `whole`). All move as the
+whole does. Printed are RMS differences over the RMS on the whole object, of off-specular, whole diffuse and scattered
+light, and of lights halfway between the basis lights relit:
 
     cut    hard cuts against the whole, within 3 pixels of a cut
     away   the same farther than an overlap from any cut
@@ -54,7 +54,7 @@ def main(words: list[str]) -> int:
     size = whole.mask.shape[1], whole.mask.shape[0]
     out = Path(given["out"])
     print(f"{'globals':8s} {'part':12s} {'cut':>8s} {'away':>8s} {'step':>8s}", flush=True)
-    for name in ("whole", "window", "own"):
+    for name in ("whole", "strewn", "own"):
         folders = [out / f"{name}.tiles" / f"tile_{i}" for i in range(1, tiling.columns * tiling.rows + 1)]
         if name == "own":
             fit_own(given["capture"], whole, tiling.regions(size), folders)

@@ -3,9 +3,9 @@
     python scripts/tiles.py capture=captures/wall out=results/wall columns=4 rows=3 [overlap_px=24] [cut=feathered]
         [globals_from=RESULT] [only=5] [overwrite=true]
 
-Beside the result its parts stand in OUT.tiles: `first`, whose globals are held, unless `globals_from` names another
-result, and `tile_1` and so on, row by row. Parts that are there are not fitted again. `only` fits one tile and puts
-nothing together, so that tiles can be fitted side by side, also on several machines.
+Beside the result its parts stand in OUT.tiles: `first`, a fit of squares strewn over the object whose globals are held,
+unless `globals_from` names another result, and `tile_1` and so on, row by row. Parts that are there are not fitted
+again. `only` fits one tile and puts nothing together: tiles can be fitted side by side, also on several machines.
 """
 
 from __future__ import annotations

@@ -7,20 +7,20 @@ import json
 import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import reflectsep
-from reflectsep import jobs, tiling
+from reflectsep import jobs, pipeline, tiling
 from reflectsep.config import FitJob, FitSettings, InfoJob, ObjectSettings, RigSettings, SimulateJob
 from reflectsep.data import Region
-from reflectsep.errors import ResultError, SettingsError
+from reflectsep.errors import FitError, ResultError, SettingsError
 from reflectsep.fit import reflectance
 from reflectsep.separation import MAPS, load
-from reflectsep.tiling import TilesJob, Tiling, first_region, join, run_tiles, say, shares, spans
+from reflectsep.tiling import TilesJob, Tiling, join, run_tiles, say, shares, spans
 
 SIZE = (64, 64)
 
@@ -169,9 +169,27 @@ def captured(tmp_path_factory):
     return out
 
 
-def test_the_first_window_lies_about_the_middle_of_the_object(captured):
-    capture = reflectsep.load_capture(captured)
-    assert first_region(capture, Region(x=0, y=0, width=20, height=36)).plain() == [8, 0, 20, 36]
+@given(st.floats(0.02, 0.9))
+def test_a_share_of_the_object_is_strewn_over_all_of_it(share):
+    mask = torch.zeros(960, 1200, dtype=torch.bool)
+    mask[100:900, 50:1150] = True
+    stack = SimpleNamespace(mask=mask)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline.dataclasses, "replace", lambda _, mask: SimpleNamespace(mask=mask))
+        found = pipeline.strewn(stack, share).mask
+    assert not found[~mask].any()
+    assert float(found.sum() / mask.sum()) == pytest.approx(share, abs=0.01)
+    halves = (found[:500], found[500:], found[:, :600], found[:, 600:])
+    wholes = (mask[:500], mask[500:], mask[:, :600], mask[:, 600:])
+    for part, all_of_it in zip(halves, wholes, strict=True):
+        assert float(part.sum() / all_of_it.sum()) == pytest.approx(share, abs=0.02)
+
+
+def test_a_share_without_a_pixel_of_the_object_is_refused():
+    mask = torch.zeros(64, 64, dtype=torch.bool)
+    mask[30:40, 30:40] = True
+    with pytest.raises(FitError, match=r"fit\.share=1e-09: no pixel of the object"):
+        pipeline.strewn(SimpleNamespace(mask=mask), 1e-9)
 
 
 @pytest.mark.slow
