@@ -1,8 +1,8 @@
 """A large capture fitted in parts: overlapping tiles under the globals of one first fit, put together to one result.
 
-Feathered, a tile's say falls linearly to nothing over its overlap with the next one, so that what two of them find is
-mixed there; with hard cuts each pixel is that of the tile in whose middle it lies deepest. Components are mixed as
-pictures and stay the parts of the measured picture; parameters are mixed as they are, of one set of globals.
+Feathered, a tile's say falls linearly to nothing over the middle of its overlap with the next one, so that what two of
+them find is mixed there; with hard cuts each pixel is that of the tile in whose middle it lies deepest. Components are
+mixed as pictures and stay the parts of the measured picture; parameters are mixed as they are, of one set of globals.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ LEAST_SHARE = 0.02
 """Of the object that gives the globals."""
 LEAST_OVERLAP_PX = 8
 """Windows of neighbours and filled holes reach about as far."""
+LEAST_SAY = 1e-6
 GLOBALS = ("a", "n_s", "n_d", "softness", "crest")
 
 
@@ -88,13 +89,22 @@ def spans(length: int, count: int, overlap: int) -> list[tuple[int, int]]:
 
 
 def say(region: Region, size: tuple[int, int], overlap: int) -> Float[Tensor, "height width"]:
-    """Weight of a tile at its pixels: 1 inside, falling over the overlap, but not where the picture itself ends."""
+    """Weight of a tile at its pixels: 1 inside, falling over the overlap, but not where the picture itself ends.
+
+    It falls over the middle half of the overlap: a tile's last pixels miss their neighbours, and have a say only where
+    no other tile has the object.
+    """
+    margin = overlap // 4
+
+    def ramp(place: Tensor) -> Tensor:
+        return ((place - margin) / (overlap - 2 * margin)).clamp(LEAST_SAY, 1.0)
+
     ramps = []
     for start, length, whole in ((region.y, region.height, size[1]), (region.x, region.width, size[0])):
         place = torch.arange(length, dtype=torch.float32) + 0.5
-        low = place / overlap if start > 0 else torch.ones(length)
-        high = (length - place) / overlap if start + length < whole else torch.ones(length)
-        ramps.append(torch.minimum(low, high).clamp_max(1.0))
+        low = ramp(place) if start > 0 else torch.ones(length)
+        high = ramp(length - place) if start + length < whole else torch.ones(length)
+        ramps.append(torch.minimum(low, high))
     return ramps[0][:, None] * ramps[1]
 
 
