@@ -23,7 +23,7 @@ MOST_SAMPLES = 20000
 FEWEST_SAMPLES = 24
 SAME_RATIO = 1.35
 """Where C and the lit frames agree this well, exposures are equal and C, the more exact, is the slab's width."""
-LEAST_PACE, MOST_PACE = 0.75, 1.5
+LEAST_PACE, MOST_PACE = 0.5, 2.0
 """Of the typical pace, in frames a pixel, at which the slab passes pixels that the width is fitted to."""
 HIGHLIGHT_RANK = 0.85
 """Pixels whose picture stands out from their median over the lights more than in this part of all are left out."""

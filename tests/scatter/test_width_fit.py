@@ -86,7 +86,7 @@ def passage_of(rows, columns):
 
 def test_pixels_that_the_slab_passes_at_another_pace_have_no_say():
     """On surfaces that turn along the light's way profiles are none that the model has."""
-    passage = passage_of([(0.5, 2.5)] * 14 + [(0.12, 2.1)] * 8 + [(0.9, 3.0)] * 4, 24)
+    passage = passage_of([(0.5, 2.5)] * 14 + [(0.12, 2.1)] * 8 + [(1.2, 3.0)] * 4, 24)
     mask = torch.ones(passage.centre.shape, dtype=torch.bool)
     even = passage_of([(0.5, 2.5)] * 26, 24)
     assert passage.step_px(mask) == pytest.approx(2.0, rel=1e-3)
