@@ -21,6 +21,8 @@ from torch import Tensor
 from reflectsep.calibrate.across_lights import across
 from reflectsep.calibrate.align_options import MARGIN_PX, AlignOptions, grown, judged
 from reflectsep.calibrate.aligned_stream import after, aligned_stream
+from reflectsep.calibrate.alpha import light_vector
+from reflectsep.calibrate.among_lights import checked_among_lights
 from reflectsep.calibrate.bracket_motion import bracket_motions
 from reflectsep.calibrate.motion import Motion, displacement, inside, positions, shifted, warp
 from reflectsep.calibrate.register import RegisterOptions, register
@@ -163,6 +165,8 @@ def align(
 
         found = by_items(len(names) - 1, between_lights)
         motions |= {name: Motion.from_plain(values) for name, values in zip(names[1:], found, strict=True)}
+        checked = checked_among_lights([motions[name] for name in names], grey, good, mask, _vectors(capture, names))
+        motions = dict(zip(names, checked, strict=True))
 
     def same_light(i: int) -> tuple[dict[str, Any], list[dict[str, Any]], list[str]]:
         sweep = capture.sweeps[i]
@@ -192,6 +196,13 @@ def align(
         warnings=tuple(warnings),
         size=(mask.shape[1], mask.shape[0]),
     )
+
+
+def _vectors(capture: Capture, names: Sequence[str]) -> Tensor | None:
+    """Light vectors; None where one is not known."""
+    vectors = [light_vector(capture.lights[name]) for name in names]
+    known = [vector for vector in vectors if vector is not None]
+    return torch.tensor(known, dtype=torch.float64) if len(known) == len(vectors) else None
 
 
 def _same_light(

@@ -162,7 +162,7 @@ def _own_light(path: Path, name: str, entry: Any) -> Light:
     given = entry.get("intensity", 1.0)
     given = given if isinstance(given, list) else [given]
     strength = _json_numbers(given, f"{where}: intensity", (1, 3), text=False)
-    return Light(name=name, direction=direction, intensity=_intensity(strength, f"{where}: intensity"))
+    return Light(name=name, direction=direction, intensity=_intensity(strength, where))
 
 
 def _alicevision(path: Path, entries: list[Any]) -> dict[str, Light]:
@@ -199,7 +199,10 @@ def _json_numbers(value: Any, where: str, lengths: tuple[int, ...], *, text: boo
 
 def _intensity(values: Sequence[float], where: str) -> tuple[float, ...]:
     if not all(math.isfinite(value) and value > 0 for value in values):
-        raise CaptureError(f"{where}: intensity {list(values)}, expected positive numbers")
+        found, expected = list(values), "three positive numbers"
+        if len(values) == 1:
+            found, expected = values[0], "a positive number"
+        raise CaptureError(f"{where}: intensity: found {found}, expected {expected}")
     return tuple(values)
 
 

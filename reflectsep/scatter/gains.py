@@ -23,6 +23,8 @@ MOST_SAMPLES = 20000
 FEWEST_SAMPLES = 24
 SAME_RATIO = 1.35
 """Where C and the lit frames agree this well, exposures are equal and C, the more exact, is the slab's width."""
+LEAST_PACE, MOST_PACE = 0.5, 2.0
+"""Of the typical pace, in frames a pixel, at which the slab passes pixels that the width is fitted to."""
 HIGHLIGHT_RANK = 0.85
 """Pixels whose picture stands out from their median over the lights more than in this part of all are left out."""
 
@@ -163,9 +165,19 @@ def _lit_frames(passage: Passage, mask: Tensor) -> float:
 
 
 def _fitted(passage: Passage, mask: Tensor, counted: float) -> float:
-    """By the profiles, where they tell."""
+    """By the profiles, where they tell.
+
+    Where the surface turns along the light's way the slab passes many pixels at once: their edges are sharper than the
+    model's and what scatters to them comes from nearer than it has it, so that the width comes out up to a tenth small.
+    In frames that are not clipped only dim pixels count, and dim ones lie there often.
+    """
     narrow, step_px = passage.narrow & mask, passage.step_px(mask)
-    return fitted_width(passage.kept, passage.centre, narrow, guess=counted, step_px=step_px) or counted
+    pace = passage.frames_per_px() * step_px
+    for pixels in (narrow & (pace > LEAST_PACE) & (pace < MOST_PACE), narrow):
+        width = fitted_width(passage.kept, passage.centre, pixels, guess=counted, step_px=step_px)
+        if width is not None:
+            return width
+    return counted
 
 
 def same_ratio(gain: float, frames: float) -> bool:

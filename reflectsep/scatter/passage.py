@@ -80,10 +80,13 @@ class Passage:
 
     def step_px(self, mask: Bool[Tensor, "height width"]) -> float:
         """Pixels that the slab moves in a frame, over the whole object."""
-        slope = torch.gradient(self.centre, dim=1 if self.sweep.direction == "x" else 0)[0]
         inside = _eroded(mask)
-        values = slope[inside if inside.any() else mask].abs()
+        values = self.frames_per_px()[inside if inside.any() else mask]
         return float(1.0 / values.median().clamp(min=1e-3))
+
+    def frames_per_px(self) -> Float[Tensor, "height width"]:
+        """By how many frames the slab passes a pixel later than the one before it along its way."""
+        return torch.gradient(self.centre, dim=1 if self.sweep.direction == "x" else 0)[0].abs()
 
 
 def watch(

@@ -118,7 +118,11 @@ def test_diligent(tmp_path):
     [
         ("filenames.txt", "001.png\n", "light_directions.txt: 2 lines, but filenames.txt has 1"),
         ("light_intensities.txt", "1 1 1\n", "light_intensities.txt: 1 lines"),
-        ("light_intensities.txt", "1 1 1\n0 1 1\n", "light_intensities.txt: light 002: intensity .* positive"),
+        (
+            "light_intensities.txt",
+            "1 1 1\n0 1 1\n",
+            r"light_intensities.txt: light 002: intensity: found \[0.0, 1.0, 1.0\], expected three positive numbers$",
+        ),
         ("light_directions.txt", "0 0 0\n0 0 1\n", "light_directions.txt: light 001: .* no direction"),
         ("filenames.txt", None, "filenames.txt: no such file"),
     ],
@@ -161,7 +165,14 @@ def test_alicevision_looks_down_and_into_the_scene(tmp_path):
         ({"lights": {"A": {"direction": ["0", "0", "1"]}}}, "light A: direction: .*3 numbers"),
         ({"lights": {"A": {"direction": [0, 0, True]}}}, "light A: direction: .*3 numbers"),
         ({"lights": {"A": {"direction": [0, 0, 0]}}}, "light A: direction: .* no direction"),
-        ({"lights": {"A": {"direction": [0, 0, 1], "intensity": 0}}}, "light A: intensity: .*positive"),
+        (
+            {"lights": {"A": {"direction": [0, 0, 1], "intensity": 0}}},
+            "light A: intensity: found 0.0, expected a positive number$",
+        ),
+        (
+            {"lights": [{"viewId": 7, "direction": [0, 0, 1], "intensity": ["0"]}]},
+            r"lights\[0\]: intensity: found 0.0, expected a positive number$",
+        ),
         ({"lights": [{"direction": [0, 0, 1], "type": "SH", "intensity": [1, 1, 1]}]}, "only directional"),
         ({"lights": [{"viewId": 1}]}, r"lights\[0\]: found"),
         ({"lights": [{"viewId": 1, "direction": ["a", 0, 1], "intensity": [1]}]}, "3 numbers"),
