@@ -30,8 +30,7 @@ from reflectsep.fit.state import State
 from reflectsep.flags import Flag, mark
 from reflectsep.room import empty
 from reflectsep.solve.joint import inverse, reduced_system
-from reflectsep.solve.local import normal_equations
-from reflectsep.solve.problem import robust_weight
+from reflectsep.solve.problem import normal_equations, robust_weight
 from reflectsep.solve.sharing import by_chunks
 
 AMBIGUOUS_COST = 2.0

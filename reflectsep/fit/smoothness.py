@@ -21,8 +21,7 @@ from reflectsep.fit.problem import LOG_C_2, Priors, normalised_lobe, unpack
 from reflectsep.fit.solution import lobe_pictures
 from reflectsep.fit.state import State
 from reflectsep.solve.joint import inverse
-from reflectsep.solve.local import normal_equations
-from reflectsep.solve.problem import robust_weight
+from reflectsep.solve.problem import normal_equations, robust_weight
 from reflectsep.solve.sharing import by_chunks
 
 SCALES_PX = (3.0, 2.0, 1.5, 1.0)

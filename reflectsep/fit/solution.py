@@ -24,10 +24,10 @@ from reflectsep.fit.problem import (
     unpack,
     unpack_globals,
 )
-from reflectsep.fit.search import scan
+from reflectsep.fit.search import joined, scan
 from reflectsep.model import lobe, lobe_argument, signed_root
 from reflectsep.room import copied
-from reflectsep.solve.joint import JointOptions, JointSolution, local_in_chunks, solve_joint
+from reflectsep.solve.joint import COMPANY, JointOptions, JointSolution, local_in_chunks, solve_joint
 from reflectsep.solve.local import Termination
 from reflectsep.solve.sharing import by_chunks
 
@@ -83,12 +83,13 @@ def fit_locals(
         found = part.local, part.cost, part.runner_up, part.converged
         return tuple(each.to(shared.device) for each in found)
 
-    return LocalFit(*by_chunks(len(obs), effort.chunk, fitted))
+    return LocalFit(*by_chunks(len(obs), COMPANY * effort.chunk, fitted))
 
 
 def fit_chunk(obs: Observations, priors: Priors, shared: Tensor, effort: Effort, robust: float | None) -> LocalFit:
-    """`fit_locals` on one chunk."""
-    candidates = scan(obs, priors, shared, keep=effort.minima)
+    """`fit_locals` on the pixels of some chunks."""
+    at_once = [slice(i, i + effort.chunk) for i in range(0, len(obs), effort.chunk)]
+    candidates = joined([scan(obs.take(i), priors.take(i), shared, keep=effort.minima) for i in at_once])
     problem = build_problem(obs, priors, robust=robust)
     # All minima in one batch: of few pixels the calls take longer than the arithmetic.
     k, pixel = candidates.cost.T.isfinite().nonzero(as_tuple=True)
