@@ -9,7 +9,6 @@ K_cj are the pictures' weighted slopes by a shared unknown g:
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -44,19 +43,19 @@ def coupled_equations(
 
     A, three = obs.alpha, 3 * obs.channels
     root, b = A.T @ (rows.w * rows.p * K), A.T @ (rows.w * rows.f * K).sum(1)
-    b[LOG_C_2] += lobe.z_with_log_C_2
+    b[LOG_C_2] += lobe.z_with_crest
     W = x.d.new_empty(len(local.T), len(shared), len(local))
     W[:three] = (root + (x.B / obs.channels * b)[:, None]).flatten(1, 2).transpose(0, 1)
     W[three] = (x.z * b).sum(1)
     if x.s_free:
         W[three + 1 :] = root.flatten(1, 2).transpose(0, 1)
-    W[:three, LOG_C_2] -= (shape.by_log_B * shape.by_d).expand(obs.channels, -1, -1).flatten(0, 1)
-    W[three, LOG_C_2] -= shape.by_log_B**2
+    W[:three, LOG_C_2] -= (shape.weight * shape.by_d).expand(obs.channels, -1, -1).flatten(0, 1)
+    W[three, LOG_C_2] -= shape.weight**2
 
     flat, weighted = K.flatten(1), (rows.w * K).flatten(1)
     H, own = weighted @ flat.T, weighted @ rows.r.flatten()
-    H[LOG_C_2, LOG_C_2] += len(local) * shape.by_log_B**2 + lobe.log_C_2_twice.sum()
-    own[LOG_C_2] += lobe.by_log_C_2.sum() - shape.by_log_B * shape.row.sum()
+    H[LOG_C_2, LOG_C_2] += len(local) * shape.weight**2 + lobe.of_crest_twice.sum()
+    own[LOG_C_2] += lobe.by_crest.sum() - shape.weight * shape.row.sum()
     return Coupled(gradient, V, W, own, H)
 
 

@@ -92,10 +92,10 @@ class OfLobe:
     cost: Float[Tensor, "pixels"]
     by_z: Float[Tensor, "3 pixels"]
     T: Float[Tensor, "3 3 pixels"]
-    by_log_C_2: Float[Tensor, "pixels"]
-    """As C_2 moves z / C_2: the gradient, its product with itself, and with z."""
-    log_C_2_twice: Float[Tensor, "pixels"]
-    z_with_log_C_2: Float[Tensor, "3 pixels"]
+    by_crest: Float[Tensor, "pixels"]
+    """As log C_2, and the crest with it, moves z / C_2: the gradient, its product with itself, and with z."""
+    of_crest_twice: Float[Tensor, "pixels"]
+    z_with_crest: Float[Tensor, "3 pixels"]
 
 
 @dataclass(frozen=True)
@@ -105,8 +105,8 @@ class OfShape:
     row: Float[Tensor, "pixels"]
     by_d: Float[Tensor, "3 pixels"]
     """By any d_c."""
-    by_log_B: float
-    """Also less its slope by log C_2."""
+    weight: float
+    """Its slope by log B, and less that by log C_2."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def put_together(
     gradient = x.d.new_empty(P, x.d.shape[-1])
     by_d = own.by_d + seen.by_root + share * by_z + shape.row * shape.by_d
     gradient[:three] = by_d.flatten(0, 1)
-    gradient[three] = (by_z * x.z).sum(0) + shape.row * shape.by_log_B
+    gradient[three] = (by_z * x.z).sum(0) + shape.row * shape.weight
     if x.s_free:
         gradient[three + 1 :] = (own.by_s + seen.by_root).flatten(0, 1)
     cost = seen.cost + own.cost + lobe.cost + 0.5 * shape.row.square()
@@ -205,7 +205,7 @@ def of_pictures(rows: Rows, A: Float[Tensor, "lights 3"]) -> OfPictures:
 
 
 def outer(a: Float[Tensor, "*channels 3 pixels"], b: Float[Tensor, "*channels 3 pixels"]) -> Tensor:
-    """a b^T."""
+    """A b^T."""
     return a[..., :, None, :] * b[..., None, :, :]
 
 
@@ -227,14 +227,14 @@ def lobe_rows(x: Unknowns, shared: Tensor, priors: Priors) -> OfLobe:
     once = turned.square() * (2.0 - direction.square().sum(0)) * direction
     T = -outer(once, direction)
     add_to_diagonal(T, near.square() + turned.square())
-    moved, moved_off = priors.lobe_weight * v, facing
+    moved = priors.lobe_weight * v
     return OfLobe(
         cost=0.5 * (lobe.square().sum(0) + facing.square().sum(0)),
         by_z=near * lobe + turned * across(facing),
         T=T,
-        by_log_C_2=-(moved * lobe).sum(0) - (moved_off * facing).sum(0),
-        log_C_2_twice=moved.square().sum(0) + moved_off.square().sum(0),
-        z_with_log_C_2=-near * moved - turned * across(moved_off),
+        by_crest=-(moved * lobe).sum(0) - facing.square().sum(0),
+        of_crest_twice=moved.square().sum(0) + facing.square().sum(0),
+        z_with_crest=-near * moved - turned * across(facing),
     )
 
 
@@ -302,8 +302,8 @@ def matrix(
     dd += half.transpose(0, 1)
     for c in range(channels):
         dd[c, :, c] += seen.M[c] + own.dd[c]
-    V[three, d] = (lobe + share * turned + shape.by_log_B * shape.by_d).flatten(0, 1)
-    V[three, three] = (turned * x.z).sum(0) + shape.by_log_B**2
+    V[three, d] = (lobe + share * turned + shape.weight * shape.by_d).flatten(0, 1)
+    V[three, three] = (turned * x.z).sum(0) + shape.weight**2
     if x.s_free:
         V[s, three] = lobe.flatten(0, 1)
         torch.mul(tie_s[:, None], tie_d, out=V[s, d])

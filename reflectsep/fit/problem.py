@@ -18,6 +18,7 @@ Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -319,16 +320,15 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
     C_1 = shared[:3] / cosine
     mean = C_1.mean()
     log_C_1 = (-mean).clamp_min(1e-3).log()
-    excess = shared[LOG_N_S].exp() * log_C_1 - torch.log(shared.new_tensor(priors.height))
-    return torch.stack(
+    excess = shared[LOG_N_S].exp() * log_C_1 - math.log(priors.height)
+    rows = torch.stack(
         [
-            *((C_1 / mean - 1.0) / priors.common_sd),
-            (shared[LOG_C_2] - log_C_1 - torch.log(shared.new_tensor(2.0))) / priors.mirror_sd,
+            (shared[LOG_C_2] - log_C_1 - math.log(2.0)) / priors.mirror_sd,
             excess.clamp_min(0.0) / priors.height_sd,
             (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.exponent_sd,
             (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.exponent_sd,
             (shared[LOG_N_D] - priors.log_n_d) / priors.n_d_sd,
             shared[SOFTNESS] / priors.softness_sd,
-            *(shared[ALPHA:] / priors.alpha_sd),
         ]
     )
+    return torch.cat([(C_1 / mean - 1.0) / priors.common_sd, rows, shared[ALPHA:] / priors.alpha_sd])

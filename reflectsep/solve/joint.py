@@ -83,8 +83,8 @@ def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: 
     S, gradient = (parts.sum(0) for parts in by_chunks(len(local), chunk, reduced))
     if problem.shared_residual is not None:
         q = problem.shared_residual(shared)
-        # In single precision, zero tangents come back from torch in double.
-        Q = torch.func.jacfwd(problem.shared_residual)(shared).to(q.dtype)
+        # In single precision, zeros come back from torch in double.
+        Q = torch.func.jacrev(problem.shared_residual)(shared).to(q.dtype)
         S, gradient = S + Q.mT @ Q, gradient + Q.mT @ q
     return ReducedSystem(S, gradient)
 
@@ -165,7 +165,10 @@ def local_in_chunks(
     chunk: int,
     which: Tensor | None = None,
 ) -> LocalSolution:
-    """`solve_local`, `chunk` blocks at a time, `COMPANY` times as many waiting for a place; of the blocks `which` alone, whose places `local` are, where it is given."""
+    """`solve_local` with `chunk` blocks under way of `COMPANY` times as many, and so on to the last.
+
+    Of the blocks `which` alone, whose places `local` are, where it is given.
+    """
 
     def solved(cut: slice) -> tuple[Tensor, ...]:
         blocks, here, there = problem.chunk(cut if which is None else which[cut], local[cut], shared)

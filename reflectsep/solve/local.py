@@ -16,7 +16,6 @@ from torch import Tensor
 
 from reflectsep.solve.problem import BlockProblem
 
-
 AT_ONCE = 1 << 10
 """Blocks under way: enough for the calls to be cheap beside the arithmetic, few enough to stay in the cache."""
 WORSE = 4.0
