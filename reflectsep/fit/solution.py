@@ -55,6 +55,8 @@ class Effort:
     """The same when all pixels are fitted."""
     voters: int = 30_000
     """Pixels that vote at most: the globals of more are known no better, and the others follow them."""
+    patience: int = 20
+    """Iterations of a pixel at most while the globals are sought: those that need more are not worth the wait there."""
     rounds: int = 4
     starts: int = 3
     chunk: int = 1 << 12
@@ -153,6 +155,9 @@ def fit_globals(
     minimum outweighs a hundred good ones.
     """
     number = max(4, int(effort.trim * len(obs)))
+    brief = lambda end: replace(end, max_iterations=min(effort.patience, end.max_iterations))  # noqa: E731
+    joint = replace(effort.joint, inner=brief(effort.joint.inner))
+    effort = replace(effort, polish=brief(effort.polish), joint=joint)
     results, passed = [], []
     for i, trial in enumerate(starts):
         shared, way = trial, []
@@ -160,9 +165,9 @@ def fit_globals(
             found = fit_locals(obs, priors, shared, effort, robust)
             keep = found.cost.argsort()[:number]
             problem = build_problem(obs.take(keep), priors.take(keep), robust=robust)
-            joint = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
-            step = float((joint.shared - shared).abs().max())
-            shared = joint.shared
+            end = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
+            step = float((end.shared - shared).abs().max())
+            shared = end.shared
             way.append(shared)
             if step < 1e-3 or met(shared, passed):
                 break
