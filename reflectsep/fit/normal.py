@@ -32,6 +32,7 @@ from reflectsep.fit.problem import (
     unpack_globals,
 )
 from reflectsep.model import diffuse_with_slope, lobe_with_slope
+from reflectsep.solve.local import total
 
 Normal = tuple[Float[Tensor, "pixels"], Float[Tensor, "P pixels"], Float[Tensor, "P P pixels"]]
 
@@ -149,7 +150,7 @@ def put_together(
     gradient = x.d.new_empty(P, x.d.shape[-1])
     by_d = own.by_d + seen.by_root + share * by_z + shape.row * shape.by_d
     gradient[:three] = by_d.flatten(0, 1)
-    gradient[three] = (by_z * x.z).sum(0) + shape.row * shape.weight
+    gradient[three] = total(by_z * x.z) + shape.row * shape.weight
     if x.s_free:
         gradient[three + 1 :] = (own.by_s + seen.by_root).flatten(0, 1)
     cost = seen.cost + own.cost + lobe.cost + 0.5 * shape.row.square()
@@ -162,7 +163,7 @@ def unknowns(local: Tensor, obs: Observations) -> Unknowns:
     split = lambda part: part.unflatten(0, (obs.channels, 3))  # noqa: E731
     d, measured, s_free = split(rows[:three]), last(obs.s_basis), len(rows) > three + 1
     s = split(rows[three + 1 :]) if s_free else measured
-    return Unknowns(d, rows[three], s, measured, s_free, rows[three].exp(), d.mean(0))
+    return Unknowns(d, rows[three], s, measured, s_free, rows[three].exp(), total(d) / len(d))
 
 
 def last(values: Float[Tensor, "pixels ..."]) -> Float[Tensor, "... pixels"]:
@@ -173,9 +174,9 @@ def last(values: Float[Tensor, "pixels ..."]) -> Float[Tensor, "... pixels"]:
 def rows_of(x: Unknowns, shared: Tensor, obs: Observations, robust: float | None) -> Rows:
     """The pictures, weighted."""
     g, A = unpack_globals(shared, obs.n_d), obs.alpha
-    width = shared[SOFTNESS] * x.s_measured.mean(1, keepdim=True).clamp_min(0.0)
-    root = last(obs.s) + A @ (x.d + (x.s - x.s_measured) if x.s_free else x.d)
-    u = A @ (g.a[:, None] + x.z)
+    width = shared[SOFTNESS] * (total(x.s_measured, 1) / 3.0).clamp_min(0.0)[:, None]
+    root = last(obs.s) + mixed(A, x.d + (x.s - x.s_measured) if x.s_free else x.d)
+    u = mixed(A, g.a[:, None] + x.z)
     body, by_root = diffuse_with_slope(root, width, g.n_d)
     shine, by_u = lobe_with_slope(u, g.n_s, g.crest)
     pull = last(obs.weight)
@@ -192,16 +193,30 @@ def rows_of(x: Unknowns, shared: Tensor, obs: Observations, robust: float | None
 def of_pictures(rows: Rows, A: Float[Tensor, "lights 3"]) -> OfPictures:
     """The pictures alone."""
     wr, wp, wf = rows.w * rows.r, rows.w * rows.p, rows.w * rows.f
-    squares = (A[:, :, None] * A[:, None]).flatten(1).T
-    square = lambda values: (squares @ values).unflatten(-2, (3, 3))  # noqa: E731
+    squares = (A[:, :, None] * A[:, None]).flatten(1)
+    square = lambda values: summed(squares, values).unflatten(-2, (3, 3))  # noqa: E731
     return OfPictures(
-        cost=(wr * (rows.r - 0.5 * wr)).sum((0, 1)),
-        by_root=A.T @ (wr * rows.p),
-        by_z=A.T @ (wr * rows.f).sum(0),
+        cost=total((wr * (rows.r - 0.5 * wr)).flatten(0, 1)),
+        by_root=summed(A, wr * rows.p),
+        by_z=summed(A, total(wr * rows.f)),
         M=square(wp * rows.p),
         N=square(wp * rows.f),
-        T=square((wf * rows.f).sum(0)),
+        T=square(total(wf * rows.f)),
     )
+
+
+def mixed(A: Float[Tensor, "lights 3"], x: Float[Tensor, "*channels 3 pixels"]) -> Tensor:
+    """A x. No product of matrices, whose rounding goes by the number of pixels: a pixel's result is its own."""
+    k = [x[..., i, None, :] * A[:, i, None] for i in range(3)]
+    return k[0] + k[1] + k[2]
+
+
+def summed(factors: Float[Tensor, "lights n"], values: Float[Tensor, "*channels lights pixels"]) -> Tensor:
+    """Sum over the lights of a light's factors times its values, (..., n, pixels), likewise."""
+    total = factors[0, :, None] * values[..., :1, :]
+    for j in range(1, len(factors)):
+        total.addcmul_(factors[j, :, None], values[..., j : j + 1, :])
+    return total
 
 
 def outer(a: Float[Tensor, "*channels 3 pixels"], b: Float[Tensor, "*channels 3 pixels"]) -> Tensor:
@@ -218,22 +233,22 @@ def lobe_rows(x: Unknowns, shared: Tensor, priors: Priors) -> OfLobe:
     """The rows lobe and facing."""
     C_2, direction = shared[LOG_C_2].exp(), last(priors.facing)
     v = x.z / C_2
-    across = lambda v: v - (v * direction).sum(0) * direction  # noqa: E731
+    across = lambda v: v - total(v * direction) * direction  # noqa: E731
     lobe = priors.lobe_weight * (v - last(priors.lobe))
     off = across(v)
     facing = priors.facing_weight * off
     near, turned = priors.lobe_weight / C_2, priors.facing_weight / C_2
     # The square of the projection, whose direction is of unit length, or none.
-    once = turned.square() * (2.0 - direction.square().sum(0)) * direction
+    once = turned.square() * (2.0 - total(direction.square())) * direction
     T = -outer(once, direction)
     add_to_diagonal(T, near.square() + turned.square())
     moved = priors.lobe_weight * v
     return OfLobe(
-        cost=0.5 * (lobe.square().sum(0) + facing.square().sum(0)),
+        cost=0.5 * total(lobe.square() + facing.square()),
         by_z=near * lobe + turned * across(facing),
         T=T,
-        by_crest=-(moved * lobe).sum(0) - facing.square().sum(0),
-        of_crest_twice=moved.square().sum(0) + facing.square().sum(0),
+        by_crest=-total(moved * lobe + facing.square()),
+        of_crest_twice=total(moved.square() + facing.square()),
         z_with_crest=-near * moved - turned * across(facing),
     )
 
@@ -247,16 +262,16 @@ def shape_row_of(x: Unknowns, shared: Tensor, obs: Observations, priors: Priors)
 def of_scattering(x: Unknowns, priors: Priors) -> OfScattering:
     """The rows parallel, ratio and measured."""
     s, whole = x.s, x.d + x.s
-    square = s.square().sum(1, keepdim=True)
+    square = total(s.square(), 1)[:, None]
     power = square + 1e-9
-    along = (whole * s).sum(1, keepdim=True) / power
+    along = total(whole * s, 1)[:, None] / power
     rest, less = whole - along * s, 1.0 - along
-    left = (rest * s).sum(1, keepdim=True)
+    left = total(rest * s, 1)[:, None]
     # Slopes of `along`; those of `rest` are I - s by_d^T and (1 - along) I - s by_s^T.
     by_d, by_s = s / power, (rest + less * s) / power
     firm, tie = priors.parallel.square(), priors.ratio_weight / len(s)
-    off = priors.ratio_weight * (along.mean((0, 1)) - priors.ratio)
-    cost = 0.5 * firm * rest.square().sum((0, 1)) + 0.5 * off.square()
+    off = priors.ratio_weight * (total(along[:, 0]) / len(s) - priors.ratio)
+    cost = 0.5 * firm * total(rest.square().flatten(0, 1)) + 0.5 * off.square()
     ratio_d, ratio_s = tie * by_d, tie * by_s
     pulled = firm * (rest - left * by_d) + off * ratio_d
     dd = -outer(firm * (2.0 - square / power) * by_d, s)
@@ -270,7 +285,7 @@ def of_scattering(x: Unknowns, priors: Priors) -> OfScattering:
     ss = outer(firm * square * by_s, by_s) - turned - turned.transpose(1, 2)
     add_to_diagonal(ss, firm * less[:, 0].square() + known)
     return OfScattering(
-        cost=cost + 0.5 * known * moved.square().sum((0, 1)),
+        cost=cost + 0.5 * known * total(moved.square().flatten(0, 1)),
         by_d=pulled,
         by_s=firm * (less * rest - left * by_s) + off * ratio_s + known * moved,
         dd=dd,
@@ -291,8 +306,8 @@ def matrix(
     d, s = slice(0, three), slice(three + 1, None)
     blocks = lambda rows, columns: V[rows, columns].unflatten(1, (channels, 3)).unflatten(0, (channels, 3))  # noqa: E731
     share = x.B / channels
-    moved, turned = share * seen.N, (T * x.z).sum(1)
-    lobe = (seen.N * x.z).sum(2)
+    moved, turned = share * seen.N, total(T * x.z, 1)
+    lobe = total(seen.N * x.z, 2)
     # Every d moves z and the shape, so that any two channels meet there: N of the one and of the other, and T.
     half = moved + 0.5 * (share.square() * T + outer(shape.by_d, shape.by_d))
     tie_d, tie_s = own.ratio_d.flatten(0, 1), own.ratio_s.flatten(0, 1)
@@ -303,7 +318,7 @@ def matrix(
     for c in range(channels):
         dd[c, :, c] += seen.M[c] + own.dd[c]
     V[three, d] = (lobe + share * turned + shape.weight * shape.by_d).flatten(0, 1)
-    V[three, three] = (turned * x.z).sum(0) + shape.weight**2
+    V[three, three] = total(turned * x.z) + shape.weight**2
     if x.s_free:
         V[s, three] = lobe.flatten(0, 1)
         torch.mul(tie_s[:, None], tie_d, out=V[s, d])

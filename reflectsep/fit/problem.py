@@ -246,6 +246,11 @@ def unpack_globals(shared: Float[Tensor, "G"], n_d: float | None) -> Globals:
     )
 
 
+def linear(x: Float[Tensor, "*pixels 3"], M: Float[Tensor, "n 3"]) -> Float[Tensor, "*pixels n"]:
+    """M x of every pixel, by the same additions however many pixels there are, which a matrix product is not."""
+    return x[..., :1] * M[:, 0] + x[..., 1:2] * M[:, 1] + x[..., 2:] * M[:, 2]
+
+
 def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: bool) -> Float[Tensor, "*pixels"]:
     """Log of |M d|^2 / (M d . V), or of mean_k d where the lights are unknown: C_2 / B by the lobe's geometry.
 
@@ -254,8 +259,8 @@ def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: boo
     if not known:
         mean = d.mean(-1)
         return (0.5 * (mean + (mean.square() + 1e-8).sqrt())).log()
-    g = d @ M.mT
-    facing = g @ view
+    g = linear(d, M)
+    facing = linear(g, view[None])[..., 0]
     # Smooth stand-ins for max(., 0): a normal turned away must not make the row infinite.
     facing = 0.5 * (facing + (facing.square() + 1e-6).sqrt())
     return (g.square().sum(-1) + 1e-6).log() - facing.log()

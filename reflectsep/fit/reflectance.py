@@ -60,6 +60,7 @@ from reflectsep.progress import Progress, silent
 from reflectsep.room import empty
 from reflectsep.solve.joint import JointOptions, costs_in_chunks
 from reflectsep.solve.local import Termination
+from reflectsep.solve.sharing import one_thread
 
 HUBER = 5.0
 """Residuals beyond this many standard deviations are cast shadows or inter-reflections, not noise."""
@@ -94,12 +95,13 @@ def fit_reflectance(
     if options.alpha_sd > 0 and options.method != "joint":
         raise FitError(f"alpha_sd {options.alpha_sd:g} with method {options.method}: alphas are refined jointly alone")
     dtype = torch.float64 if options.dtype == "float64" else torch.float32
-    obs, mask, intensity = observe(stack, scattering, options, dtype)
-    state = prepare(obs, mask, options)
-    state = start(state, options, progress)
-    if options.method == "joint":
-        state = refine(state, options, progress)
-    return describe(state, stack, scattering, intensity, options)
+    with one_thread():
+        obs, mask, intensity = observe(stack, scattering, options, dtype)
+        state = prepare(obs, mask, options)
+        state = start(state, options, progress)
+        if options.method == "joint":
+            state = refine(state, options, progress)
+        return describe(state, stack, scattering, intensity, options)
 
 
 def observe(

@@ -29,7 +29,7 @@ from reflectsep.model import lobe, lobe_argument, signed_root
 from reflectsep.room import copied
 from reflectsep.solve.joint import COMPANY, JointOptions, JointSolution, local_in_chunks, solve_joint
 from reflectsep.solve.local import Termination
-from reflectsep.solve.sharing import by_chunks
+from reflectsep.solve.sharing import SHARES, by_chunks
 
 Report = Callable[[int, int], None]
 
@@ -85,7 +85,9 @@ def fit_locals(
         found = part.local, part.cost, part.runner_up, part.converged
         return tuple(each.to(shared.device) for each in found)
 
-    return LocalFit(*by_chunks(len(obs), COMPANY * effort.chunk, fitted))
+    # Each pixel has several starts, which share a chunk's last iterations.
+    together = max(effort.chunk, min(COMPANY // effort.minima * effort.chunk, len(obs) // SHARES))
+    return LocalFit(*by_chunks(len(obs), together, fitted))
 
 
 def fit_chunk(obs: Observations, priors: Priors, shared: Tensor, effort: Effort, robust: float | None) -> LocalFit:

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from reflectsep.solve.local import LocalSolution, Termination, scale_of, solve_local, solve_positive
 from reflectsep.solve.problem import BlockProblem
-from reflectsep.solve.sharing import by_chunks
+from reflectsep.solve.sharing import by_chunks, workers
 
 MOST_DAMPING = 1e8
 """Where no step is short enough to lower the cost, there is none."""
@@ -176,7 +176,10 @@ def local_in_chunks(
         found = (each.to(local.device) for each in (part.local, part.cost, part.converged))
         return *found, torch.tensor([part.iterations])
 
-    places, cost, converged, iterations = by_chunks(len(local), COMPANY * chunk, solved)
+    # Where a block ends depends on no other, so that these cuts may go by who is there to work on them.
+    crew = workers().count
+    share = -(-len(local) // (2 * crew)) if crew > 1 else len(local)
+    places, cost, converged, iterations = by_chunks(len(local), max(chunk, min(COMPANY * chunk, share)), solved)
     return LocalSolution(local=places, cost=cost, converged=converged, iterations=int(iterations.max()))
 
 

@@ -18,6 +18,8 @@ from reflectsep.solve.problem import BlockProblem
 
 AT_ONCE = 1 << 10
 """Blocks under way: enough for the calls to be cheap beside the arithmetic, few enough to stay in the cache."""
+LANES = 64
+"""Blocks under way are a multiple of this: the library rounds what is left over beside whole vectors differently."""
 WORSE = 4.0
 """Factor of the damping after a step that was none."""
 
@@ -41,6 +43,17 @@ class LocalSolution:
     cost: Float[Tensor, "blocks"]
     converged: Bool[Tensor, "blocks"]
     iterations: int
+
+
+def total(values: Tensor, dim: int = 0) -> Tensor:
+    """Sum over a dimension by halves: unlike the library's, with the same rounding however many blocks there are."""
+    while (count := values.shape[dim]) > 1:
+        half = count // 2
+        folded = values.narrow(dim, 0, half) + values.narrow(dim, half, half)
+        if count % 2:
+            folded.narrow(dim, 0, 1).add_(values.narrow(dim, count - 1, 1))
+        values = folded
+    return values.squeeze(dim)
 
 
 def scale_of(V: Float[Tensor, "P P blocks"]) -> Float[Tensor, "P blocks"]:
@@ -68,9 +81,8 @@ def solve_positive(
         system[k + 1 :, k + 1 :].addcmul_((below * inverse[k])[:, None], below[None, : P - k - 1], value=-1.0)
     solution = system[P:]
     for k in reversed(range(P)):
-        if k + 1 < P:
-            solution[:, k] -= (system[k + 1 : P, k] * solution[:, k + 1 :]).sum(1)
         solution[:, k] *= inverse[k]
+        solution[:, :k].addcmul_(system[k, :k], solution[:, k, None], value=-1.0)
     sound = (inverse > 0).all(0) & solution.isfinite().all(0).all(0)
     return torch.where(sound, solution, 0.0)
 
@@ -82,7 +94,7 @@ def solve_damped(
     scale = scale_of(V)
     step = solve_positive(V, torch.maximum(V.diagonal().T, scale) + mu * scale, -gradient[None])[0]
     # (V + mu diag V) step = -gradient, so that step^T V step needs no product with V.
-    predicted = -0.5 * (gradient * step).sum(0) + 0.5 * mu * (scale * step.square()).sum(0)
+    predicted = 0.5 * total(step * (mu * scale * step - gradient))
     return step, predicted
 
 
@@ -136,6 +148,11 @@ def relaxed(gain: Float[Tensor, "blocks"]) -> Float[Tensor, "blocks"]:
     return (1.0 - (2.0 * gain.clamp(0.0, 2.0) - 1.0) ** 3).clamp(0.1, 2.0)
 
 
+def filled_up(index: Int[Tensor, "some"]) -> Int[Tensor, "more"]:
+    """`index` with its first entry again and again, up to whole `LANES`."""
+    return torch.cat([index, index[:1].expand(-len(index) % LANES)])
+
+
 def solve_local(
     problem: BlockProblem,
     local: Float[Tensor, "blocks P"],
@@ -151,14 +168,14 @@ def solve_local(
     so far that no step can decrease its cost. `at_once` blocks are under way; the next one takes the place of one
     that is finished, for a few that take many iterations cost as much time alone as in company.
     """
-    local, waiting = local.clone(), min(at_once, len(local))
+    local, waiting = local.clone(), min(-(-at_once // LANES) * LANES, len(local))
     cost = local.new_full((len(local),), torch.inf)
     converged, longest = torch.zeros(len(local), dtype=torch.bool, device=local.device), 0
-    active = torch.arange(waiting, device=local.device)
-    part, place = problem.take(active), local[active]
-    here, mu = Linearised.nowhere(place), place.new_full((waiting,), damping)
+    active = filled_up(torch.arange(waiting, device=local.device))
+    part, place, under_way = problem.take(active), local[active], waiting
+    here, mu = Linearised.nowhere(place), torch.full_like(place[:, 0], damping)
     age = torch.zeros_like(active)
-    while len(active):
+    while under_way:
         # Cost, gradient and matrix at the present place are kept: an iteration evaluates once, at the trial place. The
         # first of a block is at its start.
         step, predicted = solve_damped(here.V, here.gradient, mu)
@@ -189,7 +206,8 @@ def solve_local(
             waiting += filled
         if filled < len(finished):
             done[finished[:filled]] = False
-            left = (~done).nonzero()[:, 0]
+            left = (~done[:under_way]).nonzero()[:, 0]
+            under_way, left = len(left), filled_up(left)
             part, here = part.take(left), here.take(left)
             active, place, mu, age = active[left], place[left], mu[left], age[left]
     return LocalSolution(local=local, cost=cost, converged=converged, iterations=longest)
