@@ -78,6 +78,16 @@ def diffuse(root: Tensor, width: Tensor, n_d: Tensor | float) -> Tensor:
     return lit if isinstance(n_d, float) and n_d == 1.0 else positive_power(lit, n_d)
 
 
+def diffuse_with_slope(root: Tensor, width: Tensor, n_d: Tensor | float) -> tuple[Tensor, Tensor]:
+    """`diffuse` and its derivative by the root."""
+    length = (root.square() + width.square() + torch.finfo(root.dtype).tiny).sqrt()
+    lit = 0.5 * (root + length)
+    if isinstance(n_d, float) and n_d == 1.0:
+        return lit, lit / length
+    value = positive_power(lit, n_d)
+    return value, torch.where(lit > 0, n_d * value / length, 0.0)
+
+
 def lobe(u: Tensor, n_s: Tensor, crest: Tensor) -> Tensor:
     """Off-specular value of the lobe argument u: Eq. 17, or GGX's where there is a crest."""
     if not bool(crest > 0):
@@ -98,6 +108,14 @@ def lobe_slope(u: Tensor, n_s: Tensor, crest: Tensor) -> Tensor:
     tail = (1.0 + n_s * (1.0 - v.clamp(0.0, 1.0)) / 2.0) ** -3
     slope = torch.where(v > 1, v.clamp_min(1.0) ** (n_s - 1.0), tail)
     return torch.where(lit, n_s * crest ** (n_s - 1.0) * slope, torch.zeros_like(u))
+
+
+def lobe_with_slope(u: Tensor, n_s: Tensor, crest: Tensor) -> tuple[Tensor, Tensor]:
+    """`lobe` and `lobe_slope`, which have their power in common."""
+    if bool(crest > 0):
+        return lobe(u, n_s, crest), lobe_slope(u, n_s, crest)
+    value = positive_power(u, n_s)
+    return value, n_s * value / torch.where(u > 0, u, 1.0)
 
 
 def lobe_reaches(value: Tensor, n_s: Tensor, crest: Tensor) -> Tensor:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from reflectsep.fit.coupling import coupled_equations
 from reflectsep.fit.derivatives import jacobians
+from reflectsep.fit.normal import normal_equations
 from reflectsep.fit.problem import Observations, Priors, pixel_residual, shared_residual
-from reflectsep.solve.problem import BlockProblem
+from reflectsep.solve.problem import BlockProblem, Coupled
 
 
 def build_problem(obs: Observations, priors: Priors, *, robust: float | None) -> BlockProblem:
@@ -23,6 +25,12 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         return jacobians(local, shared, *regroup(data, obs, priors), with_shared=with_shared)
 
+    def normal(local: Tensor, shared: Tensor, *data: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return normal_equations(local, shared, *regroup(data, obs, priors), robust)
+
+    def coupled(local: Tensor, shared: Tensor, *data: Tensor) -> Coupled:
+        return coupled_equations(local, shared, *regroup(data, obs, priors), robust)
+
     prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1 + 3 + 3
     threshold = None
     if robust is not None:
@@ -31,6 +39,8 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
     return BlockProblem(
         residual=residual,
         jacobian=closed_form,
+        normal=normal,
+        coupled=coupled,
         data=(
             obs.images,
             obs.s,

@@ -29,6 +29,7 @@ from reflectsep.fit.problem import (
     Observations,
     Priors,
     across,
+    linear,
     mixing_of,
     normalised_lobe,
     pixel_residual,
@@ -97,10 +98,10 @@ def shape_slope(d_mean: Float[Tensor, "pixels 3"], obs: Observations) -> Float[T
         mean = d_mean.mean(-1, keepdim=True)
         # log((m + sqrt(m^2 + e)) / 2) has the slope 1 / sqrt(m^2 + e).
         return ((mean.square() + 1e-8).rsqrt() / 3.0).expand_as(d_mean)
-    g = d_mean @ obs.normal_map.mT
-    facing = (g @ obs.view)[:, None]
+    g = linear(d_mean, obs.normal_map)
+    facing = linear(g, obs.view[None])
     by_g = 2.0 * g / (g.square().sum(-1, keepdim=True) + 1e-6) - (facing.square() + 1e-6).rsqrt() * obs.view
-    return by_g @ obs.normal_map
+    return linear(by_g, obs.normal_map.mT)
 
 
 def jacobians(

@@ -28,7 +28,7 @@ from reflectsep.fit.problem import (
     unpack,
 )
 from reflectsep.solve.joint import inverse
-from reflectsep.solve.local import normal_equations
+from reflectsep.solve.problem import normal_equations
 
 SHAPE_SD = ((0.1, 0.02), (0.03, 0.005))
 """Scatter of log B about its geometric value: before anything is known of it (twice that where the lights are unknown),

@@ -42,7 +42,7 @@ class FitOptions:
     tolerance: float = 1e-6
     globals_pixels: int = 300
     chunk: int = 1 << 12
-    """Pixels times channels at once: what stays in the cache is twice as fast as what does not."""
+    """Pixels times channels at once: enough for the calls to be cheap beside the arithmetic."""
     dtype: Literal["float32", "float64"] = "float64"
     device: Literal["cpu", "cuda"] = "cpu"
     """Where chunks are searched and solved; what is kept of all pixels, and all other work, is the processor's."""

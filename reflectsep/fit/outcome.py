@@ -29,9 +29,7 @@ from reflectsep.fit.solution import lobe_pictures
 from reflectsep.fit.state import State
 from reflectsep.flags import Flag, mark
 from reflectsep.room import empty
-from reflectsep.solve.joint import inverse, reduced_system
-from reflectsep.solve.local import normal_equations
-from reflectsep.solve.problem import robust_weight
+from reflectsep.solve.joint import reduced_system, solve_firm
 from reflectsep.solve.sharing import by_chunks
 
 AMBIGUOUS_COST = 2.0
@@ -171,12 +169,12 @@ def local_deviation(state: State, covariance: Float[Tensor, "G G"]) -> Float[Ten
     def deviation(cut: slice) -> tuple[Tensor]:
         index = torch.arange(cut.start, cut.stop)
         problem = build_problem(state.obs.take(index), state.priors.take(index), robust=state.robust)
-        r, J, K = problem.linearise(state.found.local[index], state.shared)
-        weight = robust_weight(r, problem.threshold)
-        V, _ = normal_equations(r, J, weight)
-        V_inv = inverse(V)
-        pull = V_inv @ (J.mT @ (K * weight[..., None]))
-        variance = V_inv.diagonal(dim1=-2, dim2=-1) + torch.einsum("npg,gh,nph->np", pull, covariance, pull)
+        at = problem.coupled_equations(state.found.local[index], state.shared)
+        P = len(at.V)
+        eye = torch.eye(P, dtype=at.V.dtype)[..., None].expand_as(at.V)
+        solved = solve_firm(at.V, torch.cat([eye, at.W.transpose(0, 1)]))
+        own, pull = solved[:P].diagonal(), solved[P:]
+        variance = own + torch.einsum("gpn,gh,hpn->np", pull, covariance, pull)
         return (variance.clamp_min(0.0).sqrt(),)
 
     return by_chunks(len(state.obs), state.effort.chunk, deviation)[0]

@@ -18,6 +18,7 @@ Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -245,6 +246,11 @@ def unpack_globals(shared: Float[Tensor, "G"], n_d: float | None) -> Globals:
     )
 
 
+def linear(x: Float[Tensor, "*pixels 3"], M: Float[Tensor, "n 3"]) -> Float[Tensor, "*pixels n"]:
+    """M x of every pixel, by the same additions however many pixels there are, which a matrix product is not."""
+    return x[..., :1] * M[:, 0] + x[..., 1:2] * M[:, 1] + x[..., 2:] * M[:, 2]
+
+
 def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: bool) -> Float[Tensor, "*pixels"]:
     """Log of |M d|^2 / (M d . V), or of mean_k d where the lights are unknown: C_2 / B by the lobe's geometry.
 
@@ -253,8 +259,8 @@ def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: boo
     if not known:
         mean = d.mean(-1)
         return (0.5 * (mean + (mean.square() + 1e-8).sqrt())).log()
-    g = d @ M.mT
-    facing = g @ view
+    g = linear(d, M)
+    facing = linear(g, view[None])[..., 0]
     # Smooth stand-ins for max(., 0): a normal turned away must not make the row infinite.
     facing = 0.5 * (facing + (facing.square() + 1e-6).sqrt())
     return (g.square().sum(-1) + 1e-6).log() - facing.log()
@@ -319,16 +325,15 @@ def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Ten
     C_1 = shared[:3] / cosine
     mean = C_1.mean()
     log_C_1 = (-mean).clamp_min(1e-3).log()
-    excess = shared[LOG_N_S].exp() * log_C_1 - torch.log(shared.new_tensor(priors.height))
-    return torch.stack(
+    excess = shared[LOG_N_S].exp() * log_C_1 - math.log(priors.height)
+    rows = torch.stack(
         [
-            *((C_1 / mean - 1.0) / priors.common_sd),
-            (shared[LOG_C_2] - log_C_1 - torch.log(shared.new_tensor(2.0))) / priors.mirror_sd,
+            (shared[LOG_C_2] - log_C_1 - math.log(2.0)) / priors.mirror_sd,
             excess.clamp_min(0.0) / priors.height_sd,
             (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.exponent_sd,
             (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.exponent_sd,
             (shared[LOG_N_D] - priors.log_n_d) / priors.n_d_sd,
             shared[SOFTNESS] / priors.softness_sd,
-            *(shared[ALPHA:] / priors.alpha_sd),
         ]
     )
+    return torch.cat([(C_1 / mean - 1.0) / priors.common_sd, rows, shared[ALPHA:] / priors.alpha_sd])

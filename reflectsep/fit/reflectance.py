@@ -63,12 +63,15 @@ from reflectsep.progress import Progress, silent
 from reflectsep.room import empty
 from reflectsep.solve.joint import JointOptions, costs_in_chunks
 from reflectsep.solve.local import Termination
+from reflectsep.solve.sharing import one_thread
 
 HUBER = 5.0
 """Residuals beyond this many standard deviations are cast shadows or inter-reflections, not noise."""
 MIN_PICTURES = {"measured": 6, "none": 6, "unknown": 8}
 N_D_SD, N_D_SD_LEAST = 0.05, 0.01
 """Relative standard deviation of n_d: of 1 where no sweep tells, and the least that a sweep's is taken to have."""
+TRIAL = 4000
+"""Pixels that tell whether an extension is worth fitting to all of them."""
 EXTENSION_GAIN = 0.01
 """Soft shadows stay only where they lower the whole cost by this share."""
 
@@ -97,12 +100,13 @@ def fit_reflectance(
     if options.held is not None:
         options = replace(options, refine_n_d="log_n_d" in options.held.order)
     dtype = torch.float64 if options.dtype == "float64" else torch.float32
-    obs, mask, intensity = observe(stack, scattering, options, dtype)
-    state = prepare(obs, mask, options)
-    state = start(state, options, progress)
-    if options.method == "joint":
-        state = refine(state, options, progress)
-    return describe(state, stack, scattering, intensity, options)
+    with one_thread():
+        obs, mask, intensity = observe(stack, scattering, options, dtype)
+        state = prepare(obs, mask, options)
+        state = start(state, options, progress)
+        if options.method == "joint":
+            state = refine(state, options, progress)
+        return describe(state, stack, scattering, intensity, options)
 
 
 def observe(
@@ -448,13 +452,33 @@ def hand_on(state: State, radius: int) -> State:
 
 
 def try_soft_edges(state: State, progress: Progress) -> State:
-    """Free soft shadows where there is scattering; keep them only if the cost falls by more than `EXTENSION_GAIN`."""
+    """Free soft shadows where there is scattering; keep them only if the cost falls by more than `EXTENSION_GAIN`.
+
+    Of many pixels, `TRIAL` of them tell whether all are to be tried.
+    """
     if not any(bool((state.obs.s[cut] != 0).any()) for cut in cuts(len(state.obs))):
         return state
-    before = float(state.found.cost.sum())
+    every = len(state.obs) // TRIAL
+    if every > 1 and not _pays(_with_soft_edges(_every(state, every), progress), _every(state, every)):
+        return state
+    trial = _with_soft_edges(state, progress)
+    return trial if _pays(trial, state) else state
+
+
+def _with_soft_edges(state: State, progress: Progress) -> State:
+    """The joint fit with them."""
     shared, free = state.shared.clone(), state.free.clone()
     shared[SOFTNESS], free[SOFTNESS] = 0.12, True
-    trial = joint_step(rescored(replace(state, shared=shared, free=free)), "shadow edges", progress)
-    after = float(trial.found.cost.sum())
-    kept = math.isfinite(after) and after < before * (1.0 - EXTENSION_GAIN)
-    return trial if kept else state
+    return joint_step(rescored(replace(state, shared=shared, free=free)), "shadow edges", progress)
+
+
+def _pays(trial: State, state: State) -> bool:
+    before, after = float(state.found.cost.sum()), float(trial.found.cost.sum())
+    return math.isfinite(after) and after < before * (1.0 - EXTENSION_GAIN)
+
+
+def _every(state: State, step: int) -> State:
+    """One of `step` pixels, for what needs no neighbours."""
+    index, found = slice(None, None, step), state.found
+    found = LocalFit(found.local[index], found.cost[index], found.runner_up[index], found.converged[index])
+    return replace(state, obs=state.obs.take(index), priors=state.priors.take(index), found=found)

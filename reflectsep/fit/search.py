@@ -100,6 +100,11 @@ class Candidates:
     """inf where a pixel has fewer minima."""
 
 
+def joined(parts: Sequence[Candidates]) -> Candidates:
+    """Those of several runs of pixels, one after the other."""
+    return Candidates(*(torch.cat([getattr(part, name) for part in parts]) for name in ("d", "log_B", "cost")))
+
+
 def scan(
     obs: Observations,
     priors: Priors,

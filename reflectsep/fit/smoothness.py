@@ -20,9 +20,7 @@ from reflectsep.fit.neighbours import local_quadratic
 from reflectsep.fit.problem import LOG_C_2, Priors, normalised_lobe, unpack
 from reflectsep.fit.solution import lobe_pictures
 from reflectsep.fit.state import State
-from reflectsep.solve.joint import inverse
-from reflectsep.solve.local import normal_equations
-from reflectsep.solve.problem import robust_weight
+from reflectsep.solve.joint import solve_firm
 from reflectsep.solve.sharing import by_chunks
 
 SCALES_PX = (3.0, 2.0, 1.5, 1.0)
@@ -64,15 +62,14 @@ def lobe_variance(state: State) -> Float[Tensor, "pixels"]:
         index = torch.arange(cut.start, cut.stop)
         problem = build_problem(obs.take(index), priors.take(index), robust=state.robust)
         local = state.found.local[index]
-        r, J = problem.linearise_local(local, state.shared)
-        V, _ = normal_equations(r, J, robust_weight(r, problem.threshold))
-        x = unpack(local, obs.channels)
-        slope = local.new_zeros(len(index), 3, local.shape[1])
+        _, _, V = problem.normal_equations(local, state.shared)
+        x, channels = unpack(local, obs.channels), obs.channels
+        slope = local.new_zeros(3, *local.T.shape)
         for k in range(3):
-            slope[:, k, k : 3 * obs.channels : 3] = x.B[:, None] / obs.channels
-            slope[:, k, 3 * obs.channels] = x.B * x.d.mean(1)[:, k]
+            slope[k, k : 3 * channels : 3] = x.B / channels
+            slope[k, 3 * channels] = x.B * x.d.mean(1)[:, k]
         slope = slope / state.shared[LOG_C_2].exp()
-        return (torch.einsum("nkp,npq,nkq->n", slope, inverse(V), slope) / 3.0,)
+        return ((slope * solve_firm(V, slope)).sum((0, 1)) / 3.0,)
 
     return by_chunks(len(obs), state.effort.chunk, variance)[0]
 

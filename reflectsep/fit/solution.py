@@ -24,12 +24,12 @@ from reflectsep.fit.problem import (
     unpack,
     unpack_globals,
 )
-from reflectsep.fit.search import scan
+from reflectsep.fit.search import joined, scan
 from reflectsep.model import lobe, lobe_argument, signed_root
 from reflectsep.room import copied
-from reflectsep.solve.joint import JointOptions, JointSolution, local_in_chunks, solve_joint
+from reflectsep.solve.joint import COMPANY, JointOptions, JointSolution, local_in_chunks, solve_joint
 from reflectsep.solve.local import Termination
-from reflectsep.solve.sharing import by_chunks
+from reflectsep.solve.sharing import SHARES, by_chunks
 
 Report = Callable[[int, int], None]
 
@@ -55,6 +55,8 @@ class Effort:
     """The same when all pixels are fitted."""
     voters: int = 30_000
     """Pixels that vote at most: the globals of more are known no better, and the others follow them."""
+    patience: int = 20
+    """Iterations of a pixel at most while the globals are sought: those that need more are not worth the wait there."""
     rounds: int = 4
     starts: int = 3
     chunk: int = 1 << 12
@@ -83,12 +85,15 @@ def fit_locals(
         found = part.local, part.cost, part.runner_up, part.converged
         return tuple(each.to(shared.device) for each in found)
 
-    return LocalFit(*by_chunks(len(obs), effort.chunk, fitted))
+    # Each pixel has several starts, which share a chunk's last iterations.
+    together = max(effort.chunk, min(COMPANY // effort.minima * effort.chunk, len(obs) // SHARES))
+    return LocalFit(*by_chunks(len(obs), together, fitted))
 
 
 def fit_chunk(obs: Observations, priors: Priors, shared: Tensor, effort: Effort, robust: float | None) -> LocalFit:
-    """`fit_locals` on one chunk."""
-    candidates = scan(obs, priors, shared, keep=effort.minima)
+    """`fit_locals` on the pixels of some chunks."""
+    at_once = [slice(i, i + effort.chunk) for i in range(0, len(obs), effort.chunk)]
+    candidates = joined([scan(obs.take(i), priors.take(i), shared, keep=effort.minima) for i in at_once])
     problem = build_problem(obs, priors, robust=robust)
     # All minima in one batch: of few pixels the calls take longer than the arithmetic.
     k, pixel = candidates.cost.T.isfinite().nonzero(as_tuple=True)
@@ -152,6 +157,9 @@ def fit_globals(
     minimum outweighs a hundred good ones.
     """
     number = max(4, int(effort.trim * len(obs)))
+    brief = lambda end: replace(end, max_iterations=min(effort.patience, end.max_iterations))  # noqa: E731
+    joint = replace(effort.joint, inner=brief(effort.joint.inner))
+    effort = replace(effort, polish=brief(effort.polish), joint=joint)
     results, passed = [], []
     for i, trial in enumerate(starts):
         shared, way = trial, []
@@ -159,9 +167,9 @@ def fit_globals(
             found = fit_locals(obs, priors, shared, effort, robust)
             keep = found.cost.argsort()[:number]
             problem = build_problem(obs.take(keep), priors.take(keep), robust=robust)
-            joint = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
-            step = float((joint.shared - shared).abs().max())
-            shared = joint.shared
+            end = solve_joint(problem, found.local[keep], shared, effort.joint, free=free)
+            step = float((end.shared - shared).abs().max())
+            shared = end.shared
             way.append(shared)
             if step < 1e-3 or met(shared, passed):
                 break

@@ -19,12 +19,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.solve.local import LocalSolution, Termination, normal_equations, solve_local
-from reflectsep.solve.problem import BlockProblem, robust_weight
-from reflectsep.solve.sharing import by_chunks
+from reflectsep.solve.local import LocalSolution, Termination, scale_of, solve_local, solve_positive
+from reflectsep.solve.problem import BlockProblem
+from reflectsep.solve.sharing import by_chunks, workers
 
 MOST_DAMPING = 1e8
 """Where no step is short enough to lower the cost, there is none."""
+
+
+COMPANY = 16
+"""The last blocks of so many chunks are few, and few take as long as many."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,21 +74,17 @@ def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: 
 
     def reduced(cut: slice) -> tuple[Tensor, Tensor]:
         part, here, there = problem.chunk(cut, local[cut], shared)
-        r, J, K = part.linearise(here, there)
-        weight = robust_weight(r, part.threshold)
-        V, gl = normal_equations(r, J, weight)
-        weighted = K * weight[..., None]
-        W = J.mT @ weighted
-        V_inv = inverse(V)
-        S = torch.einsum("nmg,nmh->gh", weighted, K) - torch.einsum("npg,npq,nqh->gh", W, V_inv, W)
-        gradient = torch.einsum("nmg,nm->g", weighted, r) - torch.einsum("npg,npq,nq->g", W, V_inv, gl)
+        at = part.coupled_equations(here, there)
+        solved = solve_firm(at.V, torch.cat([at.W.transpose(0, 1), at.gradient[None]]))
+        taken = torch.einsum("pgn,hpn->gh", at.W, solved)
+        S, gradient = at.H - taken[:, :-1], at.shared_gradient - taken[:, -1]
         return S[None].to(local.device), gradient[None].to(local.device)
 
     S, gradient = (parts.sum(0) for parts in by_chunks(len(local), chunk, reduced))
     if problem.shared_residual is not None:
         q = problem.shared_residual(shared)
-        # In single precision, zero tangents come back from torch in double.
-        Q = torch.func.jacfwd(problem.shared_residual)(shared).to(q.dtype)
+        # In single precision, zeros come back from torch in double.
+        Q = torch.func.jacrev(problem.shared_residual)(shared).to(q.dtype)
         S, gradient = S + Q.mT @ Q, gradient + Q.mT @ q
     return ReducedSystem(S, gradient)
 
@@ -109,6 +109,13 @@ def promised(system: ReducedSystem, free: Tensor | None) -> float:
     return float(-(system.gradient @ step) - 0.5 * step @ system.S @ step)
 
 
+def solve_firm(V: Float[Tensor, "P P blocks"], right: Float[Tensor, "sides P blocks"]) -> Tensor:
+    """V^-1 right of every block; directions that no residual feels get no say instead of an infinite one."""
+    scale = scale_of(V)
+    least = max(1e-9, 20.0 * torch.finfo(V.dtype).eps)
+    return solve_positive(V, torch.maximum(V.diagonal().T, scale) + least * scale, right)
+
+
 def inverse(V: Float[Tensor, "blocks P P"]) -> Float[Tensor, "blocks P P"]:
     """V^-1 of every block; directions that no residual feels get no say instead of an infinite one."""
     diagonal = V.diagonal(dim1=-2, dim2=-1)
@@ -131,11 +138,9 @@ def follow(problem: BlockProblem, local: Tensor, shared: Tensor, step: Tensor, c
 
     def moved(cut: slice) -> tuple[Tensor]:
         part, here, before, by = problem.chunk(cut, local[cut], shared, step)
-        r, J, K = part.linearise(here, before)
-        weight = robust_weight(r, part.threshold)
-        V, gl = normal_equations(r, J, weight)
-        pull = gl + (J.mT @ (weight * (K @ by))[..., None])[..., 0]
-        there = here - (inverse(V) @ pull[..., None])[..., 0]
+        at = part.coupled_equations(here, before)
+        pull = at.gradient + torch.einsum("pgn,g->pn", at.W, by)
+        there = here - solve_firm(at.V, pull[None])[0].T
         better = part.costs(there, before + by) < part.costs(here, before + by)
         return (torch.where(better[:, None], there, here).to(local.device),)
 
@@ -160,15 +165,21 @@ def local_in_chunks(
     chunk: int,
     which: Tensor | None = None,
 ) -> LocalSolution:
-    """`solve_local`, chunk by chunk; of the blocks `which` alone, whose places `local` are, where it is given."""
+    """`solve_local` with `chunk` blocks under way of `COMPANY` times as many, and so on to the last.
+
+    Of the blocks `which` alone, whose places `local` are, where it is given.
+    """
 
     def solved(cut: slice) -> tuple[Tensor, ...]:
         blocks, here, there = problem.chunk(cut if which is None else which[cut], local[cut], shared)
-        part = solve_local(blocks, here, there, termination)
+        part = solve_local(blocks, here, there, termination, at_once=chunk)
         found = (each.to(local.device) for each in (part.local, part.cost, part.converged))
         return *found, torch.tensor([part.iterations])
 
-    places, cost, converged, iterations = by_chunks(len(local), chunk, solved)
+    # Where a block ends depends on no other, so that these cuts may go by who is there to work on them.
+    crew = workers().count
+    share = -(-len(local) // (2 * crew)) if crew > 1 else len(local)
+    places, cost, converged, iterations = by_chunks(len(local), max(chunk, min(COMPANY * chunk, share)), solved)
     return LocalSolution(local=places, cost=cost, converged=converged, iterations=int(iterations.max()))
 
 

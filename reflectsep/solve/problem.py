@@ -24,6 +24,19 @@ Residual = Callable[..., Tensor]
 Jacobians = Callable[..., tuple[Tensor, Tensor, Tensor | None]]
 
 
+@dataclass(frozen=True)
+class Coupled:
+    """Normal equations of blocks and shared parameters together."""
+
+    gradient: Float[Tensor, "P blocks"]
+    V: Float[Tensor, "P P blocks"]
+    """In its lower triangle at least."""
+    W: Float[Tensor, "P G blocks"]
+    shared_gradient: Float[Tensor, "G"]
+    """Summed over the blocks, as is H."""
+    H: Float[Tensor, "G G"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class BlockProblem:
     """Residuals of all blocks, with the data that each block needs."""
@@ -39,6 +52,10 @@ class BlockProblem:
     jacobian: Jacobians | None = None
     """Closed form: (local, shared, *data, with_shared=bool) -> r (blocks, M), dr/dl (blocks, M, P), and dr/dg
     (blocks, M, G) if asked for, else None."""
+    normal: Callable[..., tuple[Tensor, Tensor, Tensor]] | None = None
+    """Closed form of `normal_equations`, where forming J would be a waste: (local, shared, *data) -> the same."""
+    coupled: Callable[..., Coupled] | None = None
+    """Closed form of `coupled_equations`, likewise."""
     device: torch.device | None = None
     """Where blocks that are taken from it are worked on; None: where they are."""
 
@@ -88,6 +105,41 @@ class BlockProblem:
             r, J, _ = self.jacobian(local, shared, *self.data, with_shared=False)
             return r, J
         return local_jacobian(self.residual, local, shared, self.data)
+
+    def normal_equations(
+        self, local: Tensor, shared: Tensor
+    ) -> tuple[Float[Tensor, "blocks"], Float[Tensor, "P blocks"], Float[Tensor, "P P blocks"]]:
+        """Robust cost, J^T w r and J^T w J of every block, shared parameters held; V in its lower triangle at least.
+
+        Blocks come last: an entry of all matrices is one line, so that work on them goes by whole vectors.
+        """
+        if self.normal is not None:
+            return self.normal(local, shared, *self.data)
+        r, J = self.linearise_local(local, shared)
+        V, gradient = normal_equations(r, J, robust_weight(r, self.threshold))
+        return robust_cost(r, self.threshold), gradient.T.contiguous(), V.permute(1, 2, 0).contiguous()
+
+    def coupled_equations(self, local: Tensor, shared: Tensor) -> Coupled:
+        """The same with the shared parameters free."""
+        if self.coupled is not None:
+            return self.coupled(local, shared, *self.data)
+        r, J, K = self.linearise(local, shared)
+        weight = robust_weight(r, self.threshold)
+        V, gradient = normal_equations(r, J, weight)
+        weighted = K * weight[..., None]
+        return Coupled(
+            gradient=gradient.T.contiguous(),
+            V=V.permute(1, 2, 0).contiguous(),
+            W=(J.mT @ weighted).permute(1, 2, 0).contiguous(),
+            shared_gradient=torch.einsum("nmg,nm->g", weighted, r),
+            H=torch.einsum("nmg,nmh->gh", weighted, K),
+        )
+
+
+def normal_equations(r: Tensor, J: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """J^T w J and J^T w r."""
+    weighted = J * weight[..., None]
+    return weighted.mT @ J, (weighted.mT @ r[..., None])[..., 0]
 
 
 def local_jacobian(

@@ -90,6 +90,21 @@ def _said(store: Any) -> bool:
         return False
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch keeps to one thread: several cores are for several processes.
+
+    Work on a chunk is many operations, each too short to be shared out. Torch's own threads wait for each other, and
+    take three times as long on two cores as one on one; threads with a chunk each wait for Python's lock.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def by_chunks(count: int, chunk: int, work: Callable[[slice], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
     """What `work` gives for every chunk of 0 .. count - 1, joined along the first dimension in the chunks' order.
 

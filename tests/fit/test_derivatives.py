@@ -14,6 +14,19 @@ from reflectsep.solve.problem import forward_jacobian
 PIXELS, LIGHTS = 40, 7
 
 
+CASES = [
+    {},
+    {"channels": 3},
+    {"channels": 3, "s_unknown": True},
+    {"s_unknown": True, "n_d": None},
+    {"channels": 3, "n_d": 0.8, "clipped": True},
+    {"lights_known": False, "n_d": None, "channels": 3},
+    {"alphas": True},
+    {"alphas": True, "lights_known": False, "channels": 3, "s_unknown": True},
+    {"alphas": True, "n_d": 0.8, "clipped": True, "s_unknown": True, "swept": (True,) * 4 + (False,) * 3},
+]
+
+
 def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clipped=False, swept=(), alphas=False):
     """Observations, priors and parameters without any structure; shadows, lobes and clipped values among them."""
     g = torch.Generator().manual_seed(7)
@@ -58,21 +71,7 @@ def random_case(*, channels=1, s_unknown=False, n_d=1.0, lights_known=True, clip
     return obs, priors, local, shared
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        {},
-        {"channels": 3},
-        {"channels": 3, "s_unknown": True},
-        {"s_unknown": True, "n_d": None},
-        {"channels": 3, "n_d": 0.8, "clipped": True},
-        {"lights_known": False, "n_d": None, "channels": 3},
-        {"alphas": True},
-        {"alphas": True, "lights_known": False, "channels": 3, "s_unknown": True},
-        {"alphas": True, "n_d": 0.8, "clipped": True, "s_unknown": True, "swept": (True,) * 4 + (False,) * 3},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("case", CASES, ids=str)
 @pytest.mark.parametrize("softness", [0.0, 0.4])
 @pytest.mark.parametrize("ggx", [0.0, 1.0])
 def test_closed_form_is_the_derivative(case, softness, ggx):
@@ -99,3 +98,27 @@ def test_the_fit_uses_the_closed_form():
 
     fast = replace(problem, residual=forbidden)
     assert fast.linearise(local, shared)[1].shape == (PIXELS, problem.residuals(local, shared).shape[1], 4)
+
+
+@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("softness", [0.0, 0.4])
+@pytest.mark.parametrize("ggx", [0.0, 1.0])
+@pytest.mark.parametrize("robust", [None, 0.5])
+def test_normal_equations_are_those_of_the_rows(case, softness, ggx, robust):
+    obs, priors, local, shared = random_case(**case)
+    shared[SHARED_NAMES.index("softness")] = softness
+    shared[SHARED_NAMES.index("ggx")] = ggx
+    problem = build_problem(obs, priors, robust=robust)
+    of_rows = replace(problem, normal=None, coupled=None)
+    (cost, gradient, V), at = problem.normal_equations(local, shared), problem.coupled_equations(local, shared)
+    by_rows, coupled = of_rows.normal_equations(local, shared), of_rows.coupled_equations(local, shared)
+
+    def same(mine, reference):
+        assert (mine - reference).abs().max() <= 1e-12 * reference.abs().max()
+
+    lower = torch.ones(local.shape[1], local.shape[1], dtype=torch.bool).tril()
+    for mine, reference in zip((cost, gradient, V[lower]), (*by_rows[:2], by_rows[2][lower]), strict=True):
+        same(mine, reference)
+    same(at.V[lower], coupled.V[lower])
+    for name in ("gradient", "W", "shared_gradient", "H"):
+        same(getattr(at, name), getattr(coupled, name))

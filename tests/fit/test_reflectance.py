@@ -6,13 +6,15 @@ import pytest
 import torch
 
 from reflectsep.errors import FitError
+from reflectsep.fit import reflectance
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.outcome import warnings
-from reflectsep.fit.problem import LOG_N_D, LOG_N_S, MOST_LOG_N_S, Locals, s_of_lights
-from reflectsep.fit.reflectance import fit_reflectance, observe, prepare, with_noise_of_fit
-from reflectsep.fit.solution import fit_locals
+from reflectsep.fit.problem import LOG_N_D, LOG_N_S, MOST_LOG_N_S, SOFTNESS, Locals, s_of_lights
+from reflectsep.fit.reflectance import fit_reflectance, observe, prepare, try_soft_edges, with_noise_of_fit
+from reflectsep.fit.solution import LocalFit, fit_locals
 from reflectsep.flags import Flag
+from reflectsep.progress import silent
 
 QUICK = FitOptions(
     globals_pixels=40, max_iterations=6, lobe="single", prior="none", scattering_sd=0.0, method="two_step"
@@ -238,3 +240,27 @@ def test_refining_n_d_starts_from_the_sweeps_and_is_held_to_them(paper_case):
     moved[LOG_N_D] += 0.05
     # 0.05 off is 0.05 / (0.02 / 0.9) = 2.25 standard deviations.
     assert float((row(moved) - row(state.shared)).abs().max()) == pytest.approx(2.25)
+
+
+@pytest.mark.parametrize(("gain", "kept", "fitted"), [(0.02, True, [192, 576]), (0.005, False, [192])])
+def test_some_of_many_pixels_tell_whether_soft_shadows_are_worth_fitting(small_case, monkeypatch, gain, kept, fitted):
+    obs, mask, _ = observe(small_case.stack, small_case.scattering, QUICK, torch.float64)
+    state = prepare(obs, mask, QUICK)
+    flat = obs.images[:, 0, 0]
+    local = torch.zeros(len(obs), 4, dtype=torch.float64)
+    state = replace(state, found=LocalFit(local, torch.ones_like(flat), flat, flat > 0))
+    sizes = []
+
+    def joint_step(state, stage, progress):
+        sizes.append(len(state.obs))
+        assert state.shared[SOFTNESS] > 0
+        assert state.free[SOFTNESS]
+        cost = torch.full_like(state.found.cost, 1.0 - gain)
+        return replace(state, found=replace(state.found, cost=cost))
+
+    monkeypatch.setattr(reflectance, "TRIAL", 192)
+    monkeypatch.setattr(reflectance, "joint_step", joint_step)
+    monkeypatch.setattr(reflectance, "rescored", lambda state: state)
+    found = try_soft_edges(state, silent)
+    assert sizes == fitted
+    assert (found.shared[SOFTNESS] > 0) == kept

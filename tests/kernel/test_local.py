@@ -13,8 +13,8 @@ from reflectsep.kernel.local import solve_pixels
 from reflectsep.kernel.problem import Bounds, pack_constants, quadratic, read_constants, read_data
 from reflectsep.kernel.step import CONVERGED, EXHAUSTED, FAILED, Stop
 from reflectsep.model import positive_power
-from reflectsep.solve.local import Termination, normal_equations, solve_local
-from reflectsep.solve.problem import BlockProblem
+from reflectsep.solve.local import Termination, solve_local
+from reflectsep.solve.problem import BlockProblem, normal_equations
 
 TIGHT = Stop(tolerance=1e-14, floor=1e-26, max_iterations=100)
 

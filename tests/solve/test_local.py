@@ -5,8 +5,8 @@ from itertools import pairwise
 import pytest
 import torch
 
-from reflectsep.solve.local import Termination, normal_equations, solve_damped, solve_local
-from reflectsep.solve.problem import BlockProblem
+from reflectsep.solve.local import LANES, Termination, relaxed, solve_damped, solve_local, solve_positive
+from reflectsep.solve.problem import BlockProblem, normal_equations
 
 
 def decay(local, shared, x, y):
@@ -86,25 +86,74 @@ def test_an_outlier_is_weighed_down():
     assert far(robust) < 0.25 * far(plain)
 
 
-def test_the_damped_step_solves_its_equations():
+@pytest.mark.parametrize("at_once", [1, 100, 299])
+def test_blocks_that_wait_for_a_place_end_where_they_would_have(at_once):
+    problem, start, shared, _ = decays(blocks=300)
+    together, in_turn = solve_local(problem, start, shared), solve_local(problem, start, shared, at_once=at_once)
+    assert torch.equal(in_turn.local, together.local)
+    assert torch.equal(in_turn.cost, together.cost)
+    assert torch.equal(in_turn.converged, together.converged)
+    assert in_turn.iterations == together.iterations
+
+
+def test_no_more_blocks_are_under_way_than_may_be():
+    problem, start, shared, _ = decays(blocks=300)
+    sizes = []
+
+    def watched(local, shared, x, y):
+        sizes.append(len(x))
+        return decay(local, shared, x, y)
+
+    solve_local(BlockProblem(residual=watched, data=problem.data), start, shared, at_once=LANES)
+    assert set(sizes) == {LANES}
+    assert LANES * len(sizes) < 1.5 * solve_local(problem, start, shared).iterations * 300
+
+
+def random_systems():
     g = torch.Generator().manual_seed(2)
     J = torch.randn(6, 8, 3, generator=g, dtype=torch.float64) * torch.tensor([1.0, 1e-2, 1e2], dtype=torch.float64)
     r = torch.randn(6, 8, generator=g, dtype=torch.float64)
-    weight = torch.rand(6, 8, generator=g, dtype=torch.float64)
+    return J, r, torch.rand(6, 8, generator=g, dtype=torch.float64)
+
+
+def test_the_damped_step_solves_its_equations():
+    J, r, weight = random_systems()
     mu = torch.logspace(-6, 2, 6, dtype=torch.float64)
     V, gradient = normal_equations(r, J, weight)
-    step = solve_damped(V, gradient, mu)
+    lower = V.tril().permute(1, 2, 0)  # what is above the diagonal has no say
+    step, predicted = solve_damped(lower, gradient.T, mu)
     for p in range(6):
         w = torch.diag(weight[p])
         dense = J[p].T @ w @ J[p]
         torch.testing.assert_close(V[p], dense)
         system = dense + mu[p] * torch.diag(dense.diagonal())
         expected = -torch.linalg.solve(system, J[p].T @ w @ r[p])
-        torch.testing.assert_close(step[p], expected, rtol=1e-6, atol=0)
+        torch.testing.assert_close(step[:, p], expected, rtol=1e-6, atol=0)
+        linear = r[p] + J[p] @ expected
+        promise = 0.5 * (r[p] @ w @ r[p] - linear @ w @ linear)
+        torch.testing.assert_close(predicted[p], promise, rtol=1e-6, atol=1e-12)
+
+
+def test_several_right_sides_and_a_matrix_that_is_not_positive():
+    J, r, weight = random_systems()
+    V, _ = normal_equations(r, J, weight)
+    V[4, 1, 1] = -1.0
+    right = torch.randn(2, 3, 6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    solution = solve_positive(V.permute(1, 2, 0), V.diagonal(dim1=1, dim2=2).T, right)
+    assert (solution[..., 4] == 0).all()
+    for p in (0, 1, 2, 3, 5):
+        torch.testing.assert_close(solution[:, :, p], torch.linalg.solve(V[p], right[:, :, p].T).T, rtol=1e-8, atol=0)
+
+
+def test_a_step_as_good_as_promised_lowers_the_damping_and_one_that_barely_helps_raises_it():
+    factor = relaxed(torch.tensor([1.0, 0.5, 0.0, 5.0, -3.0]))
+    torch.testing.assert_close(factor, torch.tensor([0.1, 1.0, 2.0, 0.1, 2.0]))
+    assert (relaxed(torch.linspace(0, 1, 20)).diff() <= 0).all()
 
 
 def test_a_parameter_that_nothing_feels_stays_where_it_is():
-    V = torch.tensor([[[2.0, 0.0], [0.0, 0.0]]], dtype=torch.float64)
-    step = solve_damped(V, torch.tensor([[1.0, 0.0]], dtype=torch.float64), torch.tensor([1e-3], dtype=torch.float64))
-    assert step[0, 1] == 0.0
+    V = torch.tensor([[[2.0], [0.0]], [[0.0], [0.0]]], dtype=torch.float64)
+    mu = torch.tensor([1e-3], dtype=torch.float64)
+    step, _ = solve_damped(V, torch.tensor([[1.0], [0.0]], dtype=torch.float64), mu)
+    assert step[1, 0] == 0.0
     torch.testing.assert_close(step[0, 0], torch.tensor(-0.5 / 1.001, dtype=torch.float64))
