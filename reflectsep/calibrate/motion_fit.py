@@ -76,7 +76,7 @@ def solve_motion(
     floor = options.noise_floor * float(_bright(level))
     state = replace(state, coefficients=_fit_mix(level, moved, level.weight * valid))
     sigma = None if begin is None else begin.sigma
-    for _ in range(options.iterations):
+    for i in range(options.iterations):
         residual, moved, valid = residual_of(level, state)
         if int(valid.sum()) < FEWEST_PIXELS // 4:
             return state
@@ -88,11 +88,13 @@ def solve_motion(
         weights = (1.0 - (residual / (TUKEY * sigma)).square()).clamp_min(0).square() * valid * level.weight
         state = replace(state, sigma=sigma, weights=weights)
         columns = _columns(level, state, moved, model, drifting)
-        step, covariance = _step(columns, residual, weights, level, options)
-        state = replace(state, covariance=covariance)
+        system = _normal_equations(columns, residual, weights)
+        step = -torch.linalg.solve(system.gram, system.gradient) / system.scale
         state = _moved(state, step, model, drifting, level)
         motion = step[: len(step) - count]
-        if (motion.numel() == 0 or float(motion.abs().max()) < 1e-4) and sigma <= 1.01 * robust:
+        settled = (motion.numel() == 0 or float(motion.abs().max()) < 1e-4) and sigma <= 1.01 * robust
+        if settled or i == options.iterations - 1:
+            state = replace(state, covariance=_covariance(system, residual, weights, level, options))
             break
     residual, _, valid = residual_of(level, state)
     unit = (residual / (TUKEY * state.sigma)).square()
@@ -135,28 +137,41 @@ def centred(level: Level) -> tuple[Tensor, Tensor, float]:
     return (x - (width - 1) / 2) / scale, (y - (height - 1) / 2) / scale, scale
 
 
-def _step(
-    columns: Tensor, residual: Tensor, weights: Tensor, level: Level, options: RegisterOptions
-) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton step, and the covariance of the unknowns with tiles as the independent draws."""
+@dataclass(frozen=True)
+class _System:
+    """Normal equations in units in which every unknown weighs alike."""
+
+    gram: Tensor
+    gradient: Tensor
+    scale: Tensor
+    columns: Tensor
+    force: Tensor
+    """Of every pixel, its derivatives and its weighted residual: the gradient is their product."""
+
+
+def _normal_equations(columns: Tensor, residual: Tensor, weights: Tensor) -> _System:
+    """Those of the pixels that count."""
     counts = weights.flatten() > 0
     columns, w, error = columns[counts], weights.flatten()[counts], residual.flatten()[counts]
     scale = (columns.square() * w[:, None]).sum(0).sqrt().clamp_min(1e-30)
     unit = columns / scale
     gram = unit.mT @ (w[:, None] * unit)
     gram = gram + 1e-9 * torch.eye(gram.shape[0], dtype=gram.dtype)
-    step = -torch.linalg.solve(gram, unit.mT @ (w * error)) / scale
-    inverse = torch.linalg.inv(gram)
+    return _System(gram, unit.mT @ (w * error), scale, unit, w * error)
+
+
+def _covariance(system: _System, residual: Tensor, weights: Tensor, level: Level, options: RegisterOptions) -> Tensor:
+    """Covariance of the unknowns with tiles as the independent draws."""
+    inverse = torch.linalg.inv(system.gram)
     density = max(_noise_density(residual, weights, options), 1e-30)
     plain = inverse * density
-    tile = tile_index(level.weight, options.tiles).flatten()[counts]
-    sums = torch.zeros(options.tiles**2, unit.shape[1], dtype=unit.dtype)
-    sums.index_add_(0, tile, (w * error)[:, None] * unit)
+    tile = tile_index(level.weight, options.tiles).flatten()[weights.flatten() > 0]
+    sums = torch.zeros(options.tiles**2, len(plain), dtype=plain.dtype)
+    sums.index_add_(0, tile, system.force[:, None] * system.columns)
     tiled = inverse @ (sums.mT @ sums) @ inverse
     # Tiles see what noise alone does not say, but a few that hold most of the outline are too few draws by themselves.
-    excess = float((gram @ tiled).trace()) / density / len(plain)
-    covariance = plain * max(1.0, excess) / (scale[:, None] * scale[None, :])
-    return step, covariance
+    excess = float((system.gram @ tiled).trace()) / density / len(plain)
+    return plain * max(1.0, excess) / (system.scale[:, None] * system.scale[None, :])
 
 
 def _noise_density(residual: Tensor, weights: Tensor, options: RegisterOptions) -> float:
