@@ -14,15 +14,15 @@ from reflectsep.estimate import Part
 from reflectsep.fit.options import FitOptions
 
 SOLVING_US = {
-    "pixels": (300,),
-    "joint fit": (230,),
-    "shadow edges": (310,),
-    "neighbourhood": (210, 135),
-    "smooth lobes": (140, 95, 85, 85, 90, 60),
+    "pixels": (195,),
+    "joint fit": (150,),
+    "shadow edges": (110,),
+    "neighbourhood": (75, 50),
+    "smooth lobes": (85, 45, 42, 42, 42, 35),
 }
 """Microseconds a pixel of a grey fit of few lights; `_effort` says how it grows with what a pixel has."""
-GLOBALS_S = (3.8, 2.9)
-"""Of 300 pixels of a grey fit of few lights; it grows with the power 1.7 of `_effort`."""
+GLOBALS_S = (3.6, 2.6)
+"""Of 300 pixels of a grey fit of few lights; it grows with the root of `_effort`, for calls take most of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
 def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
     """Parts of the fit itself."""
     effort = _effort(counts)
-    globals_s = [s * effort**1.7 * options.globals_pixels / 300 for s in GLOBALS_S]
+    globals_s = [s * effort**0.5 * options.globals_pixels / 300 for s in GLOBALS_S]
     if options.held is not None:
         globals_s = []
     elif options.prior != "auto":
