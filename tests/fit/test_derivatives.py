@@ -9,6 +9,7 @@ import torch
 
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.problem import SHARED_NAMES, Locals, Observations, Priors
+from reflectsep.solve.local import LANES
 from reflectsep.solve.problem import forward_jacobian
 
 PIXELS, LIGHTS = 40, 7
@@ -122,3 +123,14 @@ def test_normal_equations_are_those_of_the_rows(case, softness, ggx, robust):
     same(at.V[lower], coupled.V[lower])
     for name in ("gradient", "W", "shared_gradient", "H"):
         same(getattr(at, name), getattr(coupled, name))
+
+
+@pytest.mark.parametrize("case", [{"channels": 3, "s_unknown": True}, {"n_d": 0.8, "clipped": True}], ids=str)
+def test_normal_equations_of_a_pixel_do_not_depend_on_the_others(case, monkeypatch):
+    monkeypatch.setitem(globals(), "PIXELS", 5 * LANES)
+    obs, priors, local, shared = random_case(**case)
+    problem = build_problem(obs, priors, robust=5.0)
+    whole = problem.normal_equations(local, shared)
+    for part in (slice(LANES, 2 * LANES), slice(0, 3 * LANES)):
+        for some, of_all in zip(problem.take(part).normal_equations(local[part], shared), whole, strict=True):
+            assert torch.equal(some, of_all[..., part])
