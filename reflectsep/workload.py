@@ -15,14 +15,14 @@ from reflectsep.fit.options import FitOptions
 
 SOLVING_US = {
     "pixels": (195,),
-    "joint fit": (150,),
+    "joint fit": (135,),
     "shadow edges": (110,),
-    "neighbourhood": (75, 50),
-    "smooth lobes": (85, 45, 42, 42, 42, 35),
+    "neighbourhood": (70, 95),
+    "smooth lobes": (55, 48, 42, 42, 42, 42),
 }
 """Microseconds a pixel of a grey fit of few lights; `_effort` says how it grows with what a pixel has."""
-GLOBALS_S = (3.6, 2.6)
-"""Of 300 pixels of a grey fit of few lights; it grows with the root of `_effort`, for calls take most of it."""
+GLOBALS_S = (3.0, 2.6)
+"""Of 300 pixels of a grey fit of few lights; it grows with the power 1.7 of `_effort`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,14 +48,13 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
     sweeps = [sweep for sweep in capture.sweeps if sweep.light in capture.names]
     parts = []
     if aligned:
-        pairs = 0.2 + (counts.lights - 1) * (1.0 + 20e-6 * counts.size)
-        parts = [Part(name="alignment", label="alignment", expected_s=pairs, kind="reading", steps="even")]
+        pairs = 0.2 + (counts.lights - 1) * (1.0 + 37e-6 * counts.pixels)
+        parts = [Part(name="alignment", label="alignment", expected_s=pairs, steps="even")]
         parts += [
             Part(
                 name=f"alignment {sweep.light} {sweep.direction}",
                 label="alignment",
-                expected_s=0.1 * values * sweep.count,
-                kind="reading",
+                expected_s=37e-6 * counts.pixels + 0.1 * values * sweep.count,
                 steps="even",
             )
             for sweep in sweeps
@@ -86,7 +85,7 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
 def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
     """Parts of the fit itself."""
     effort = _effort(counts)
-    globals_s = [s * effort**0.5 * options.globals_pixels / 300 for s in GLOBALS_S]
+    globals_s = [s * effort**1.7 * options.globals_pixels / 300 for s in GLOBALS_S]
     if options.held is not None:
         globals_s = []
     elif options.prior != "auto":
@@ -107,7 +106,7 @@ def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
 
 
 def reporting(counts: Counts, sweeps: int) -> list[Part]:
-    """The report: figures of a sweep are its largest share."""
-    figures = sweeps * (0.7 + 8e-6 * counts.size)
-    seconds = 8.0 + figures + 2.8e-6 * counts.size * counts.lights * counts.channels
+    """The report: its figures."""
+    figures = sweeps * (0.7 + 1e-6 * counts.size)
+    seconds = 8.0 + figures + 2e-6 * counts.size * counts.lights * counts.channels
     return [Part(name="report", label="report", expected_s=seconds, kind="drawing", steps="uneven")]
