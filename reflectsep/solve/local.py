@@ -3,7 +3,7 @@
     (V + mu diag V) dl = -gl,    V = J^T w J,    gl = J^T w r          one small system a block
 
 Every block has its own damping mu, its own acceptance and its own end; nothing is summed over the batch, so that a
-block's result depends neither on its neighbours nor on how the batch was cut. Converged blocks leave the batch.
+block's result depends neither on its neighbours nor on how the batch was cut. Finished blocks make room for others.
 """
 
 from __future__ import annotations
@@ -95,7 +95,9 @@ def solve_damped(
     step = solve_positive(V, torch.maximum(V.diagonal().T, scale) + mu * scale, -gradient[None])[0]
     # (V + mu diag V) step = -gradient, so that step^T V step needs no product with V.
     predicted = 0.5 * total(step * (mu * scale * step - gradient))
-    return step, predicted
+    # No step where V is not positive is no sign of an end: more damping may make it so.
+    stuck = (step == 0).all(0) & (gradient != 0).any(0)
+    return step, torch.where(stuck, torch.inf, predicted)
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Linearised:
     def at(cls, problem: BlockProblem, local: Float[Tensor, "blocks P"], shared: Tensor) -> Linearised:
         """At `local`; a cost that is no number counts as infinite."""
         cost, gradient, V = problem.normal_equations(local, shared)
-        return cls(cost.nan_to_num(nan=torch.inf), gradient, V)
+        return cls(cost.nan_to_num(nan=torch.inf, posinf=torch.inf), gradient, V)
 
     @classmethod
     def nowhere(cls, local: Float[Tensor, "blocks P"]) -> Linearised:
@@ -165,8 +167,8 @@ def solve_local(
     """Minimise every block's cost over its own unknowns from `local`.
 
     A block ends converged when its predicted relative decrease falls below the tolerance, or when damping has grown
-    so far that no step can decrease its cost. `at_once` blocks are under way; the next one takes the place of one
-    that is finished, for a few that take many iterations cost as much time alone as in company.
+    so far that no step can decrease its cost. `at_once` blocks, in whole `LANES`, are under way; the next one takes the
+    place of one that is finished, for a few that take many iterations cost as much time alone as in company.
     """
     local, waiting = local.clone(), min(-(-at_once // LANES) * LANES, len(local))
     cost = local.new_full((len(local),), torch.inf)
@@ -186,6 +188,7 @@ def solve_local(
         mu = torch.where(begun, mu * torch.where(better, relaxed(gain), WORSE), mu)
         end = begun & ((predicted <= termination.tolerance * here.cost + termination.floor) | (mu > 1e9))
         done = end | (age >= termination.max_iterations)
+        sound = end & here.cost.isfinite()
         mu = mu.clamp_min(1e-9)
         worse = (~better).nonzero()[:, 0]
         trial[worse] = place[worse]
@@ -194,7 +197,7 @@ def solve_local(
             continue
         finished = done.nonzero()[:, 0]
         which = active[finished]
-        local[which], cost[which], converged[which] = place[finished], here.cost[finished], end[finished]
+        local[which], cost[which], converged[which] = place[finished], here.cost[finished], sound[finished]
         longest = max(longest, int(age[finished].max()) - 1)
         filled = min(len(finished), len(local) - waiting)
         if filled:

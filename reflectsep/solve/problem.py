@@ -182,7 +182,7 @@ def robust_cost(r: Float[Tensor, "blocks residuals"], threshold: Tensor | None) 
         return 0.5 * r.square().sum(-1)
     size = r.abs()
     linear = threshold * size - 0.5 * threshold * torch.where(threshold.isfinite(), threshold, 0.0)
-    return torch.where(size <= threshold, 0.5 * r.square(), linear).nan_to_num(nan=torch.inf).sum(-1)
+    return torch.where(size <= threshold, 0.5 * r.square(), linear).nan_to_num(nan=torch.inf, posinf=torch.inf).sum(-1)
 
 
 def robust_weight(r: Float[Tensor, "blocks residuals"], threshold: Tensor | None) -> Tensor:

@@ -242,8 +242,11 @@ def test_refining_n_d_starts_from_the_sweeps_and_is_held_to_them(paper_case):
     assert float((row(moved) - row(state.shared)).abs().max()) == pytest.approx(2.25)
 
 
-@pytest.mark.parametrize(("gain", "kept", "fitted"), [(0.02, True, [192, 576]), (0.005, False, [192])])
-def test_some_of_many_pixels_tell_whether_soft_shadows_are_worth_fitting(small_case, monkeypatch, gain, kept, fitted):
+@pytest.mark.parametrize(
+    ("gains", "kept", "fitted"),
+    [((0.02, 0.02), True, [192, 576]), ((0.005, 0.02), False, [192]), ((0.02, 0.005), False, [192, 576])],
+)
+def test_some_of_many_pixels_tell_whether_soft_shadows_are_worth_fitting(small_case, monkeypatch, gains, kept, fitted):
     obs, mask, _ = observe(small_case.stack, small_case.scattering, QUICK, torch.float64)
     state = prepare(obs, mask, QUICK)
     flat = obs.images[:, 0, 0]
@@ -253,9 +256,10 @@ def test_some_of_many_pixels_tell_whether_soft_shadows_are_worth_fitting(small_c
 
     def joint_step(state, stage, progress):
         sizes.append(len(state.obs))
+        assert torch.equal(state.obs.images, obs.images[:: 576 // sizes[-1]])
         assert state.shared[SOFTNESS] > 0
         assert state.free[SOFTNESS]
-        cost = torch.full_like(state.found.cost, 1.0 - gain)
+        cost = torch.full_like(state.found.cost, 1.0 - gains[len(sizes) - 1])
         return replace(state, found=replace(state.found, cost=cost))
 
     monkeypatch.setattr(reflectance, "TRIAL", 192)

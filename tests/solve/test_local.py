@@ -72,6 +72,28 @@ def test_a_block_that_is_no_number_does_not_spoil_the_others():
     others = torch.arange(60) != 4
     assert float((found.local - truth)[others].abs().max()) < 1e-6
     assert found.local.isfinite().all()
+    assert not found.converged[4]
+    assert found.converged[others].all()
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_block_without_a_finite_cost_says_so(value):
+    problem, start, shared, _ = decays(blocks=3)
+    x, y = problem.data
+    broken = BlockProblem(residual=decay, data=(x, y.index_fill(0, torch.tensor([1]), value)))
+    found = solve_local(broken, start, shared)
+    assert found.cost.isfinite().tolist() == [True, False, True]
+    assert found.converged.tolist() == [True, False, True]
+
+
+def test_a_matrix_that_is_not_positive_is_damped_rather_than_called_the_end():
+    V = torch.tensor([[1.0, 2.0], [2.0, 1.0]], dtype=torch.float64)[..., None].expand(2, 2, 2)
+    gradient = torch.ones(2, 2, dtype=torch.float64)
+    step, predicted = solve_damped(V, gradient, torch.tensor([1e-4, 10.0], dtype=torch.float64))
+    assert (step[:, 0] == 0).all()
+    assert predicted[0] == torch.inf
+    assert (step[:, 1] < 0).all()
+    assert predicted[1].isfinite()
 
 
 def test_an_outlier_is_weighed_down():
