@@ -160,6 +160,9 @@ class FitSettings:
     prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
     device: Literal["cpu", "cuda"] = setting("cpu", "where chunks of pixels are solved; for cuda a larger fit.chunk")
+    compile: Literal["auto", "always", "never"] = setting(
+        "auto", "the solver compiled by a C++ compiler: where the object is large, always, or never"
+    )
     share: float = setting(
         1.0, "of the object that is fitted, in squares strewn evenly: for globals to hold", above=0.0, at_most=1.0
     )

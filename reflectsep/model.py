@@ -90,30 +90,37 @@ def diffuse_with_slope(root: Tensor, width: Tensor, n_d: Tensor | float) -> tupl
 
 def lobe(u: Tensor, n_s: Tensor, crest: Tensor) -> Tensor:
     """Off-specular value of the lobe argument u: Eq. 17, or GGX's where there is a crest."""
-    if not bool(crest > 0):
-        return positive_power(u, n_s)
+    return ggx(u, n_s, crest) if bool(crest > 0) else positive_power(u, n_s)
+
+
+def ggx(u: Tensor, n_s: Tensor, crest: Tensor) -> Tensor:
+    """The lobe of GGX microfacets."""
     v = u / crest
     tail = (1.0 + n_s * (1.0 - v.clamp(0.0, 1.0)) / 2.0) ** -2
     value = torch.where(v > 1, positive_power(v.clamp_min(1.0), n_s), tail) - (1.0 + n_s / 2.0) ** -2
     return crest**n_s * torch.where(v > 0, value, torch.zeros_like(value))
 
 
+def lobe_with_slope(u: Tensor, n_s: Tensor, crest: Tensor) -> tuple[Tensor, Tensor]:
+    """`lobe` and its derivative by u, which have their power in common."""
+    return ggx_with_slope(u, n_s, crest) if bool(crest > 0) else power_with_slope(u, n_s)
+
+
 def lobe_slope(u: Tensor, n_s: Tensor, crest: Tensor) -> Tensor:
     """Derivative of `lobe` by u."""
-    lit = u > 0
-    if not bool(crest > 0):
-        safe = torch.where(lit, u, torch.ones_like(u))
-        return torch.where(lit, n_s * safe ** (n_s - 1.0), torch.zeros_like(u))
+    return lobe_with_slope(u, n_s, crest)[1]
+
+
+def ggx_with_slope(u: Tensor, n_s: Tensor, crest: Tensor) -> tuple[Tensor, Tensor]:
+    """The lobe of GGX microfacets and its derivative by u."""
     v = u / crest
     tail = (1.0 + n_s * (1.0 - v.clamp(0.0, 1.0)) / 2.0) ** -3
     slope = torch.where(v > 1, v.clamp_min(1.0) ** (n_s - 1.0), tail)
-    return torch.where(lit, n_s * crest ** (n_s - 1.0) * slope, torch.zeros_like(u))
+    return ggx(u, n_s, crest), torch.where(u > 0, n_s * crest ** (n_s - 1.0) * slope, torch.zeros_like(u))
 
 
-def lobe_with_slope(u: Tensor, n_s: Tensor, crest: Tensor) -> tuple[Tensor, Tensor]:
-    """`lobe` and `lobe_slope`, which have their power in common."""
-    if bool(crest > 0):
-        return lobe(u, n_s, crest), lobe_slope(u, n_s, crest)
+def power_with_slope(u: Tensor, n_s: Tensor) -> tuple[Tensor, Tensor]:
+    """The paper's lobe and its derivative by u."""
     value = positive_power(u, n_s)
     return value, n_s * value / torch.where(u > 0, u, 1.0)
 

@@ -9,8 +9,10 @@ from torch import Tensor
 
 from reflectsep.fit.coupling import coupled_equations
 from reflectsep.fit.derivatives import jacobians
+from reflectsep.fit.fused import solve_fused
 from reflectsep.fit.normal import normal_equations
 from reflectsep.fit.problem import Observations, Priors, pixel_residual, shared_residual
+from reflectsep.solve.local import LocalSolution, Termination
 from reflectsep.solve.problem import BlockProblem, Coupled
 
 
@@ -30,6 +32,10 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
 
     def coupled(local: Tensor, shared: Tensor, *data: Tensor) -> Coupled:
         return coupled_equations(local, shared, *regroup(data, obs, priors), robust)
+
+    def held(local: Tensor, shared: Tensor, termination: Termination, *data: Tensor) -> LocalSolution:
+        assert obs.fused is not None  # else it is not offered
+        return solve_fused(local, shared, *regroup(data, obs, priors), robust, termination, obs.fused)
 
     prior_rows = 1 + 3 * obs.channels * (2 if obs.s_unknown else 1) + 1 + 3 + 3
     threshold = None
@@ -56,6 +62,7 @@ def build_problem(obs: Observations, priors: Priors, *, robust: float | None) ->
             priors.s_weight,
         ),
         threshold=threshold,
+        held=None if obs.fused is None else held,
         device=obs.device,
         shared_residual=lambda shared: shared_residual(shared, obs.cosine, priors),
     )

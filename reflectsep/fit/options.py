@@ -46,6 +46,9 @@ class FitOptions:
     dtype: Literal["float32", "float64"] = "float64"
     device: Literal["cpu", "cuda"] = "cpu"
     """Where chunks are searched and solved; what is kept of all pixels, and all other work, is the processor's."""
+    compile: Literal["auto", "always", "never"] = "auto"
+    """The solver of all pixels as a compiled loop: from `WORTH_COMPILING` values on (pixels times channels), on the
+    processor, where there is a C++ compiler. It takes the same steps but for rounding."""
     given: Learnt | None = None
     """What another fit has learnt of the same object."""
     globals: Literal["held", "start"] = "held"

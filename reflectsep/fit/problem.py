@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.fit.mixing import Mixing, mixing
+from reflectsep.kernel.compiling import Speed
 from reflectsep.model import Globals, edge_width, reflectance
 
 SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "ggx", "log_n_d")
@@ -71,6 +72,8 @@ class Observations:
     """The scattering roots of the basis lights are local unknowns too."""
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     """Where chunks of pixels are searched and solved."""
+    fused: Speed | None = None
+    """How the compiled solver runs; None: the plain one."""
 
     def __len__(self) -> int:
         """Number of pixels."""

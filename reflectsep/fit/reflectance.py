@@ -58,6 +58,7 @@ from reflectsep.fit.solution import (
 )
 from reflectsep.fit.state import State
 from reflectsep.flags import Flag
+from reflectsep.kernel.compiling import Speed
 from reflectsep.model import diffuse
 from reflectsep.progress import Progress, silent
 from reflectsep.room import empty
@@ -100,8 +101,12 @@ def fit_reflectance(
     if options.held is not None:
         options = replace(options, refine_n_d="log_n_d" in options.held.order)
     dtype = torch.float64 if options.dtype == "float64" else torch.float32
+    cores = torch.get_num_threads()
     with one_thread():
         obs, mask, intensity = observe(stack, scattering, options, dtype)
+        speed = Speed(compile=options.compile, cores=cores)
+        if options.device == "cpu" and speed.compiles(obs.images[..., 0].numel(), obs.images):
+            obs = replace(obs, fused=replace(speed, compile="always"))
         state = prepare(obs, mask, options)
         state = start(state, options, progress)
         if options.method == "joint":

@@ -32,7 +32,7 @@ from reflectsep.kernel.problem import (
     value_of,
     weight_of,
 )
-from reflectsep.kernel.step import ACTIVE, FIRST_DAMPING, PLACE, Stop, pinned, two_iterations
+from reflectsep.kernel.step import ACTIVE, FIRST_DAMPING, FOUR, Stop, pinned, two_iterations
 from reflectsep.solve.joint import ReducedSystem, shared_step
 
 INNER = Stop()
@@ -183,7 +183,7 @@ class Passes:
                 at += len(values)
             places[:, :count] = local[:, cut]
             state = self.iterate(self.follow(places, maps, before, after, step), maps, after)
-            place = state[PLACE].contiguous()
+            place = state[FOUR.place].contiguous()
             total += self.reduce(place, maps, after)[:, :count].sum(1, dtype=torch.float64)
             result[:, cut] = place[:, :count]
         return total

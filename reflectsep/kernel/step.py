@@ -17,10 +17,56 @@ from reflectsep.kernel.problem import Bounds, Constants, Data, Form, quadratic, 
 
 ACTIVE, CONVERGED, EXHAUSTED, FAILED, EMPTY = range(5)
 """Status of a slot; FAILED: not finite at its start."""
-PLACE, COST, DAMPING, COUNT, STATUS, MATRIX, GRADIENT = slice(0, 4), 4, 5, 6, 7, slice(8, 18), slice(18, 22)
-STATE_ROWS = 22
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e9
 SOFTEN, HARDEN = 0.2, 5.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Rows of the state of a block."""
+
+    unknowns: int
+    system: int
+    """Rows of what is known of the cost at the present place, beside its value: gradient and matrix."""
+
+    @property
+    def place(self) -> slice:
+        """The unknowns."""
+        return slice(0, self.unknowns)
+
+    @property
+    def cost(self) -> int:
+        """At the present place."""
+        return self.unknowns
+
+    @property
+    def damping(self) -> int:
+        """Of the next step."""
+        return self.unknowns + 1
+
+    @property
+    def count(self) -> int:
+        """Iterations so far."""
+        return self.unknowns + 2
+
+    @property
+    def status(self) -> int:
+        """`ACTIVE` or how it ended."""
+        return self.unknowns + 3
+
+    @property
+    def head(self) -> int:
+        """Rows up to here are what a pixel comes and goes with; then follows the system."""
+        return self.unknowns + 4
+
+    @property
+    def rows(self) -> int:
+        """All of them."""
+        return self.head + self.system
+
+
+FOUR = Layout(4, system=14)
+MATRIX, GRADIENT = slice(8, 18), slice(18, 22)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +97,8 @@ def pinned(x: Sequence[Tensor], g: list[Tensor], V: list[Tensor], bounds: Bounds
 
 def iterate(state: list[Tensor], data: Data, constants: Constants, form: Form, stop: Stop) -> list[Tensor]:
     """The state one iteration on; finished pixels stay as they are."""
-    here, cost, mu, count, status = state[PLACE], state[COST], state[DAMPING], state[COUNT], state[STATUS]
+    here, cost, mu = state[FOUR.place], state[FOUR.cost], state[FOUR.damping]
+    count, status = state[FOUR.count], state[FOUR.status]
     fresh = cost == float("inf")
     g, V = pinned(here, state[GRADIENT], state[MATRIX], form.bounds)
     scale = scales(V)
@@ -86,7 +133,7 @@ def iterate(state: list[Tensor], data: Data, constants: Constants, form: Form, s
 
 
 def two_iterations(state: Tensor, maps: Tensor, packed: Tensor, form: Form, stop: Stop) -> Tensor:
-    """(STATE_ROWS, block) and (rows, block) to the state two iterations on: halves what a call costs."""
+    """(rows of the state, block) and (rows, block) to the state two iterations on: halves what a call costs."""
     data, constants = read_data(maps.unbind(0), form), read_constants(packed, form)
     rows = list(state.unbind(0))
     for _ in range(2):

@@ -170,6 +170,8 @@ def solve_local(
     so far that no step can decrease its cost. `at_once` blocks, in whole `LANES`, are under way; the next one takes the
     place of one that is finished, for a few that take many iterations cost as much time alone as in company.
     """
+    if problem.held is not None:
+        return problem.held(local, shared, termination, *problem.data)
     local, waiting = local.clone(), min(-(-at_once // LANES) * LANES, len(local))
     cost = local.new_full((len(local),), torch.inf)
     converged, longest = torch.zeros(len(local), dtype=torch.bool, device=local.device), 0

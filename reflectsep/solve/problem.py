@@ -56,6 +56,9 @@ class BlockProblem:
     """Closed form of `normal_equations`, where forming J would be a waste: (local, shared, *data) -> the same."""
     coupled: Callable[..., Coupled] | None = None
     """Closed form of `coupled_equations`, likewise."""
+    held: Callable[..., Any] | None = None
+    """A solver of its own for blocks under shared parameters that are held: (local, shared, termination, *data) to the
+    `LocalSolution` that `solve_local` finds."""
     device: torch.device | None = None
     """Where blocks that are taken from it are worked on; None: where they are."""
 
