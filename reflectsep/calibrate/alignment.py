@@ -10,6 +10,8 @@ none by less than `align_options.LEAST_PX`. Motions are composed, so that a pict
 
 from __future__ import annotations
 
+import itertools
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -35,6 +37,8 @@ from reflectsep.solve.sharing import by_items
 
 CLIPPED_SHARE = 0.5
 CLIPPED_BESIDE = 0.01
+SIDE_BY_SIDE_PX = 1 << 22
+"""Larger pictures are registered one after the other, in the memory of one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,13 +161,16 @@ def align(
         grey[i] = torch.where(torch.isfinite(own), own, 0.0)
     motions = {name: Motion(reason="reference" if i == 0 else "not looked for") for i, name in enumerate(names)}
     if options.scope == "all":
+        finished, turn = itertools.count(1), threading.Lock()
 
         def between_lights(i: int) -> dict[str, Any]:
             found = across(grey[0], grey[i + 1], mask, options)
-            progress("alignment", i + 1, len(names) - 1)
+            with turn:
+                progress("alignment", next(finished), len(names) - 1)
             return found.plain()
 
-        found = by_items(len(names) - 1, between_lights)
+        at_once = torch.get_num_threads() if mask.numel() <= SIDE_BY_SIDE_PX else 1
+        found = by_items(len(names) - 1, between_lights, at_once=at_once)
         motions |= {name: Motion.from_plain(values) for name, values in zip(names[1:], found, strict=True)}
         checked = checked_among_lights([motions[name] for name in names], grey, good, mask, _vectors(capture, names))
         motions = dict(zip(names, checked, strict=True))

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -156,18 +157,23 @@ def cuts_of(count: int, chunk: int) -> list[slice]:
     return [slice(i, min(i + chunk, count)) for i in range(0, count, chunk)]
 
 
-def by_items(count: int, work: Callable[[int], Any]) -> list[Any]:
+def by_items(count: int, work: Callable[[int], Any], *, at_once: int = 1) -> list[Any]:
     """What `work` gives for every item 0 .. count - 1, in their order, the items shared like chunks.
 
     Args:
         count: items in all.
         work: from an item to plain values, those that JSON has.
+        at_once: items that a process that is alone works on side by side, each on one of torch's threads: for items
+            whose operations are long. `work` must bear that.
 
     Raises:
         WorkerError: another process of the run is gone.
     """
     if workers().count == 1 or count == 0:
-        return [work(i) for i in range(count)]
+        if min(at_once, count) < 2:
+            return [work(i) for i in range(count)]
+        with one_thread(), ThreadPoolExecutor(min(at_once, count)) as pool:
+            return list(pool.map(work, range(count)))
 
     def line(cut: slice) -> tuple[Tensor]:
         text = json.dumps(work(cut.start)) + "\n"

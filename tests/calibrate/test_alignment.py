@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from reflectsep.calibrate import across_lights
+from reflectsep.calibrate import across_lights, alignment
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.aligned_stream import aligned_stream
 from reflectsep.calibrate.alignment import Alignment, align, covered
@@ -18,6 +18,7 @@ from reflectsep.data import Frame, Sweep
 from reflectsep.flags import Flag
 from reflectsep.io.frames import open_sweep
 from reflectsep.io.stack import read_full, read_mask
+from reflectsep.progress import silent
 from reflectsep.synth.drift import Drift
 
 from .conftest import simulated, truth
@@ -25,12 +26,12 @@ from .conftest import simulated, truth
 EYE = torch.eye(3, dtype=torch.float64)
 
 
-def aligned(capture, options=None):
+def aligned(capture, options=None, progress=silent):
     response = response_of(capture)
     raw = read_full(capture)
     pictures, clipped = develop_pictures(capture, raw, response)
     streams = [developed_stream(capture, open_sweep(capture, sweep), response) for sweep in capture.sweeps]
-    return align(capture, raw.names, pictures, clipped, read_mask(capture), streams, options=options)
+    return align(capture, raw.names, pictures, clipped, read_mask(capture), streams, options=options, progress=progress)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +70,18 @@ def test_lights_are_found_against_the_first(drifted, found):
         error = displacement(truth(drifted, f"full/{name}").matrix @ torch.linalg.inv(motion.matrix), mask)
         assert error < 0.2
         assert error < 4 * motion.sd_px
+
+
+def test_pictures_side_by_side_are_those_one_after_the_other(drifted, monkeypatch):
+    told = []
+    progress = lambda stage, done, total: told.append((stage, done, total))  # noqa: E731
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    together = aligned(drifted, AlignOptions(scope="all"), progress).pictures
+    lights = [entry for entry in told if entry[0] == "alignment"]
+    assert lights == [("alignment", i + 1, len(drifted.names) - 1) for i in range(len(drifted.names) - 1)]
+    monkeypatch.setattr(alignment, "SIDE_BY_SIDE_PX", 0)
+    apart = aligned(drifted, AlignOptions(scope="all")).pictures
+    assert {name: m.plain() for name, m in together.items()} == {name: m.plain() for name, m in apart.items()}
 
 
 @pytest.mark.parametrize("factor", [1, 2])

@@ -5,8 +5,10 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -116,6 +118,25 @@ def test_a_few_chunks_too_many_become_even_ones():
 def test_items_alone_are_what_work_gives():
     assert by_items(3, lambda i: {"i": i}) == [{"i": 0}, {"i": 1}, {"i": 2}]
     assert by_items(0, lambda i: i) == []
+
+
+def test_items_side_by_side_keep_their_order_and_one_thread_each():
+    meeting = threading.Barrier(2, timeout=20.0)
+
+    def work(i):
+        meeting.wait()  # which only two that are under way at once get past
+        return i, torch.get_num_threads()
+
+    assert by_items(4, work, at_once=2) == [(0, 1), (1, 1), (2, 1), (3, 1)]
+
+
+def test_an_item_that_fails_side_by_side_is_not_lost():
+    def work(i):
+        if i == 2:
+            raise ValueError("item 2")
+
+    with pytest.raises(ValueError, match="item 2"):
+        by_items(4, work, at_once=2)
 
 
 def test_without_other_processes_nothing_is_shared():
