@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad, unfold
 
 from reflectsep.fit.chunks import in_chunks
+from reflectsep.kernel.linear import factorise, packed_at, solve
 from reflectsep.room import rows
 
 MAD_TO_SD = 1.4826
@@ -130,38 +131,50 @@ def _quadratic(values: Tensor, weight: Tensor, mask: Tensor, sigma_px: float) ->
     reach = max(1, round(3 * sigma_px))
     along = torch.arange(-reach, reach + 1, dtype=values.dtype) / sigma_px
     window = torch.exp(-0.5 * along.square())
-    weights, weighted = to_map(weight[:, None], mask), to_map(values * weight[:, None], mask)
-
+    profiles = torch.stack([along**power * window for power in range(5)])
     holed = window.clone()
     holed[reach] = 0.0  # the pixel itself has no say
 
-    def line(picture: Tensor, kernel: Tensor, axis: int) -> Tensor:
-        shape, padding = ((-1, 1), (reach, 0)) if axis == 0 else ((1, -1), (0, reach))
-        return conv2d(picture[:, None], kernel.view(1, 1, *shape), padding=padding)[:, 0]
+    def moments(picture: Float[Tensor, "channels height width"], degree: int) -> dict[tuple[int, int], Tensor]:
+        """(channels, pixels) of x^px y^py under the window for every px + py <= degree, the pixel itself left out."""
+        # Of a power of x and one of y: two passes along lines, each with all powers at once.
+        columns = lines(picture, torch.cat([profiles[: degree + 1], holed[None]]), 0)
+        found = {}
+        for py in range(degree + 1):
+            powers = profiles[: degree + 1 - py]
+            if py == 0:
+                powers = torch.cat([holed[None], powers[1:]])
+            for px, moment in enumerate(lines(columns[:, py], powers, 1).unbind(1)):
+                total = moment + columns[:, -1] if px == py == 0 else moment
+                found[px, py] = total[:, mask]
+        return found
 
-    # Moments are products of a power of x and one of y: two passes along lines, the first ones shared.
-    pictures = (weights, weighted)
-    rows = [[line(picture, along**py * window, 0) for py in range(5 - 2 * i)] for i, picture in enumerate(pictures)]
-
-    def moment(px: int, py: int, which: int) -> Float[Tensor, "pixels channels"]:
-        if px == py == 0:
-            total = line(rows[which][0], holed, 1) + line(pictures[which], holed, 0)
-        else:
-            total = line(rows[which][py], along**px * window, 1)
-        return total[:, mask].T
-
-    powers = {(a + c, b + d) for a, b in QUADRATIC for c, d in QUADRATIC}
-    moments = {power: moment(*power, 0)[:, 0] for power in sorted(powers)}
-    right = torch.stack([moment(a, b, 1) for a, b in QUADRATIC], 1)
-    # A trace of a ridge: where few neighbours are left the surface is flatter rather than wild.
-    ridge = 1e-4 * torch.eye(len(QUADRATIC), dtype=values.dtype)
+    weights, right = to_map(weight[:, None], mask), to_map(values * weight[:, None], mask)
+    of_weights, of_values = moments(weights, 4), moments(right, 2)
+    size = len(QUADRATIC)
+    upper = [(i, j) for i in range(size) for j in range(i, size)]
 
     def centre(cut: slice) -> Tensor:
-        rows = [torch.stack([moments[a + c, b + d][cut] for c, d in QUADRATIC], -1) for a, b in QUADRATIC]
-        system = torch.stack(rows, -2)
-        unit = system.diagonal(dim1=-2, dim2=-1).clamp_min(1e-30).rsqrt()
-        inverse = torch.linalg.inv(system * unit[:, :, None] * unit[:, None, :] + ridge)
-        surface = (inverse @ (right[cut] * unit[:, :, None])) * unit[:, :, None]
-        return torch.cat([surface[:, 0], (inverse[:, 0, 0] * unit[:, 0].square())[:, None]], -1)
+        at = [of_weights[a + c, b + d][0, cut] for (a, b), (c, d) in ((QUADRATIC[i], QUADRATIC[j]) for i, j in upper)]
+        unit = [at[packed_at(size, k, k)].clamp_min(1e-30).rsqrt() for k in range(size)]
+        system = [entry * unit[i] * unit[j] for (i, j), entry in zip(upper, at, strict=True)]
+        # A trace of a ridge: where few neighbours are left the surface is flatter rather than wild.
+        ridge = [torch.full_like(unit[0], 1e-4)] * size
+        # Of the surface only its height here is wanted, a sum of the right hand sides by the inverse's first row.
+        first = [torch.ones_like(unit[0]), *[torch.zeros_like(unit[0])] * (size - 1)]
+        row = [x * u * unit[0] for x, u in zip(solve(factorise(system, ridge), first), unit, strict=True)]
+        height = torch.zeros_like(of_values[0, 0][:, cut])
+        for x, power in zip(row, QUADRATIC, strict=True):
+            height = height + x * of_values[power][:, cut]
+        return torch.cat([height, row[0][None]]).T
 
     return in_chunks(len(values), centre)
+
+
+def lines(
+    picture: Float[Tensor, "channels height width"], profiles: Float[Tensor, "profiles window"], axis: int
+) -> Float[Tensor, "channels profiles height width"]:
+    """The picture correlated with each profile along its columns (axis 0) or its rows (1); zeros beyond its edge."""
+    reach = profiles.shape[1] // 2
+    shape, padding = ((-1, 1), (reach, 0)) if axis == 0 else ((1, -1), (0, reach))
+    return conv2d(picture[:, None], profiles.view(len(profiles), 1, *shape), padding=padding)

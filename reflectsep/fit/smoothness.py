@@ -87,22 +87,42 @@ def clearly_seen(state: State, variance: Tensor) -> Bool[Tensor, "pixels"]:
     return seen & (variance < 4.0 * variance[seen].median())
 
 
+@dataclass(frozen=True)
+class Lobes:
+    """Every pixel's lobe as it is, before its neighbours are heard."""
+
+    lobe: Float[Tensor, "pixels 3"]
+    variance: Float[Tensor, "pixels"]
+    """By the pixel's own pictures."""
+    seen: Bool[Tensor, "pixels"]
+    """Clearly."""
+
+    @classmethod
+    def of(cls, state: State) -> Lobes:
+        """The lobes that the fit has found so far."""
+        x = unpack(state.found.local, state.obs.channels)
+        lobe = in_chunks(len(state.obs), lambda cut: normalised_lobe(x.take(cut), state.shared))
+        variance = lobe_variance(state)
+        return cls(lobe, variance, clearly_seen(state, variance))
+
+
 def predict(state: State, scale_px: float, spread: float | None = None) -> Prediction | None:
     """Every pixel's lobe from its neighbours; None where too few lobes are seen to learn `spread`.
 
     Neighbours count by their certainty, and less the farther they are from what their own neighbours say.
     """
-    x = unpack(state.found.local, state.obs.channels)
-    lobe = in_chunks(len(state.obs), lambda cut: normalised_lobe(x.take(cut), state.shared))
-    own = lobe_variance(state)
-    seen = clearly_seen(state, own)
+    return _predicted(Lobes.of(state), state.mask, scale_px, spread)
+
+
+def _predicted(lobes: Lobes, mask: Tensor, scale_px: float, spread: float | None) -> Prediction | None:
+    lobe, own, seen = lobes.lobe, lobes.variance, lobes.seen
     if spread is None and int(seen.sum()) < LEAST_SEEN:
         return None
     square = 1e-4 if spread is None else spread**2
     trust = torch.ones_like(own)
     predicted, variance = lobe, own
     for _ in range(4):
-        predicted, variance = local_quadratic(lobe, trust / (own + square), state.mask, scale_px)
+        predicted, variance = local_quadratic(lobe, trust / (own + square), mask, scale_px)
         error = in_chunks(len(lobe), lambda cut, p=predicted: (lobe[cut] - p[cut]).square().mean(-1))
         if spread is None:
             total = float(error[seen].median()) / MEDIAN_OF_CHI_SQUARED
@@ -119,7 +139,9 @@ def scales_of(state: State) -> list[tuple[float, float]]:
     On a rough surface or in noise a narrow window follows its few neighbours' errors; on a finely curved one a wide
     window is no surface at all.
     """
-    known = [(scale, found) for scale in SCALES_PX if (found := predict(state, scale)) is not None]
+    lobes = Lobes.of(state)
+    tried = [(scale, _predicted(lobes, state.mask, scale, None)) for scale in SCALES_PX]
+    known = [(scale, found) for scale, found in tried if found is not None]
     if not known:
         return []
     best = min(range(len(known)), key=lambda i: known[i][1].error)
