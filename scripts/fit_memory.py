@@ -1,11 +1,12 @@
 """Memory and disk of a whole fit, stage by stage, with as few iterations as there can be.
 
-`python scripts/fit_memory.py capture=FOLDER out=FOLDER [as_megapixels=24] [report=true]`
+`python scripts/fit_memory.py capture=FOLDER out=FOLDER [as_megapixels=24] [registration=all] [report=true]`
 
 What a fit holds does not depend on how long it iterates, so a fit whose iterations are cut down to a few shows what a
 whole one takes. Memory is that which the system cannot get rid of otherwise (RssAnon, and shared memory); what is in
 files it writes out and reads back, and that is given beside it. Tensors go into files from a size that is to this
-capture as that of `reflectsep/room.py` is to one of `as_megapixels`. The result is no separation to be used.
+capture as that of `reflectsep/room.py` is to one of `as_megapixels`. `registration=none` leaves drift alone. The result
+is no separation to be used.
 """
 
 from __future__ import annotations
@@ -86,12 +87,12 @@ def main(words: list[str]) -> int:
     import torch
 
     from reflectsep import jobs, room
-    from reflectsep.config import FitJob, FitSettings
+    from reflectsep.config import CalibrationSettings, FitJob, FitSettings
     from reflectsep.io.capture import load_capture
     from reflectsep.io.stack import read_mask
 
     given = dict(word.split("=", 1) for word in words)
-    wrong = sorted(given.keys() - {"capture", "out", "as_megapixels", "report"})
+    wrong = sorted(given.keys() - {"capture", "out", "as_megapixels", "registration", "report"})
     if wrong or not {"capture", "out"} <= given.keys():
         print(f"capture=FOLDER and out=FOLDER are needed; unknown: {', '.join(wrong) or 'none'}", file=sys.stderr)
         return 2
@@ -108,6 +109,7 @@ def main(words: list[str]) -> int:
         overwrite=True,
         baseline=False,
         report=report,
+        calibration=CalibrationSettings(registration=given.get("registration", "all")),  # pyright: ignore[reportArgumentType]
         fit=FitSettings(globals_pixels=100),
     )
     before, watch = resident()[0], Watch()
