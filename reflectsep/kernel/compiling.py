@@ -131,10 +131,24 @@ def _of_the_call(guards: Sequence[Any]) -> list[bool]:
 
 @functools.cache
 def has_compiler() -> bool:
-    """Whether a C++ compiler is at hand; says once that without one everything runs, slower."""
+    """Whether kernels can be compiled here, by a trial; where not, says once why, and that everything runs, slower."""
     found = shutil.which(os.environ.get("CXX", "g++")) or shutil.which("clang++")
-    if found is None:
-        print(
-            "reflectsep: no C++ compiler (g++ or $CXX): kernels run uncompiled, several times slower", file=sys.stderr
-        )
-    return found is not None
+    reason = "no C++ compiler (g++ or $CXX)" if found is None else _trouble()
+    if reason is not None:
+        print(f"reflectsep: {reason}: kernels run uncompiled, several times slower", file=sys.stderr)
+    return reason is None
+
+
+def _trouble() -> str | None:
+    """What keeps torch from compiling: a compiler without Python's or OpenMP's headers, a cache that is read-only."""
+    try:
+        compiled(_twice, ())(torch.ones(64))
+    except (RuntimeError, OSError, ImportError) as error:
+        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+        told = next((line for line in lines if "error:" in line), lines[0] if lines else "no reason given")
+        return f"nothing can be compiled ({told})"
+    return None
+
+
+def _twice(values: Tensor) -> Tensor:
+    return 2.0 * values

@@ -30,6 +30,25 @@ def test_without_a_compiler_everything_runs_and_says_so_once(scene, no_compiler,
     assert capsys.readouterr().err.count("no C++ compiler") == 1
 
 
+def test_a_compiler_that_fails_is_as_good_as_none_and_says_why_once(scene, monkeypatch, capsys):
+    def broken(function, form):
+        raise RuntimeError(
+            "CppCompileError: C++ compile error\n  kernel.cpp:2:10: fatal error: Python.h: no such file\n"
+        )
+
+    compiling.has_compiler.cache_clear()
+    monkeypatch.setattr(compiling.shutil, "which", lambda name: "/usr/bin/g++")
+    monkeypatch.setattr(compiling, "compiled", broken)
+    made = scene(200, sigma=0.01)
+    for _ in range(2):
+        found = solve_pixels(made.problem, made.start, made.lobe, speed=Speed(compile="always"))
+    compiling.has_compiler.cache_clear()
+    plain = solve_pixels(made.problem, made.start, made.lobe, speed=Speed(compile="never"))
+    assert torch.equal(found.local, plain.local)
+    said = capsys.readouterr().err
+    assert said.count("nothing can be compiled") == said.count("kernel.cpp:2:10: fatal error: Python.h") == 1
+
+
 def test_small_problems_are_never_compiled(monkeypatch):
     monkeypatch.setattr(compiling, "has_compiler", lambda: True)
     like = torch.zeros(1)
