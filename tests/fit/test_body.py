@@ -56,6 +56,25 @@ def test_a_patch_that_faces_away_has_a_negative_root():
     assert float(error.amax((1, 2)).quantile(0.9)) < 0.02
 
 
+def test_a_picture_that_a_highlight_hides_from_the_first_guess_is_heard_again():
+    b = bodies(400, 1, low=0.02)
+    b[..., 1] *= 0.2  # so dim that the guess puts the second light behind the horizon
+    images = pictures(b)
+    images[..., 0] += 2.0
+    assert float((fitted(images) - b).abs().amax((1, 2)).median()) < 10 * NOISE
+
+
+def test_within_the_noise_it_is_least_squares_by_the_pictures_weights():
+    g = torch.Generator().manual_seed(3)
+    images = pictures(bodies())
+    images += 0.3 * NOISE * torch.randn(images.shape, generator=g, dtype=torch.float64)
+    weight = (0.1 + 0.9 * torch.rand(images.shape, generator=g, dtype=torch.float64)) / NOISE
+    found = robust_body(images, weight, some_alpha(), 1.0)
+    rows = weight[..., None] * some_alpha()
+    expected = torch.linalg.lstsq(rows, (weight * images)[..., None]).solution[..., 0]
+    torch.testing.assert_close(found, expected, rtol=0, atol=0.03 * NOISE)
+
+
 def test_a_pixel_does_not_depend_on_the_others():
     images = pictures(bodies())
     images[::3, :, 1] += 0.4

@@ -10,7 +10,7 @@ import torch
 
 from reflectsep.fit.blocks import build_problem
 from reflectsep.fit.elimination import damped_step
-from reflectsep.fit.fused import solve_fused
+from reflectsep.fit.fused import layout_of, one_iteration, solve_fused
 from reflectsep.fit.lines import (
     form_of,
     linearised,
@@ -25,6 +25,7 @@ from reflectsep.fit.lines import (
 from reflectsep.fit.normal import normal_equations
 from reflectsep.fit.problem import SHARED_NAMES, Observations, Priors
 from reflectsep.kernel.compiling import Speed
+from reflectsep.kernel.step import ACTIVE, CONVERGED, MOST_DAMPING
 from reflectsep.solve.local import Termination, solve_damped, solve_local
 
 from .test_derivatives import CASES, PIXELS, random_case
@@ -129,6 +130,42 @@ def test_out_of_iterations_is_not_converged(well_posed):
     assert not found.converged.any()
     assert found.iterations == 1
     assert (found.cost >= plain.cost * (1.0 - 1e-9)).all()
+
+
+@pytest.fixture
+def under_way(well_posed):
+    """Slots after their first iteration, and what takes them one further, to a tolerance of nothing."""
+    obs, priors, start, shared, _ = well_posed
+    form = form_of(obs, shared)
+    layout = layout_of(form)
+    packed = torch.cat([pack_constants(obs, priors, shared, 2.0), shared.new_tensor([0.0, 0.0, 50.0])])
+    state = shared.new_zeros(layout.rows, PIXELS)
+    state[layout.place], state[layout.cost], state[layout.damping] = start.T, torch.inf, 1.0
+    state[layout.status] = ACTIVE
+    maps = pack_data(obs, priors, shared)
+    further = lambda state: one_iteration(state, maps, packed, form)  # noqa: E731
+    return layout, further(state), further
+
+
+def test_a_finished_pixel_stays_while_the_others_go_on(under_way):
+    layout, state, further = under_way
+    unhindered = further(state)
+    pixel = int((unhindered[layout.place] != state[layout.place]).any(0).nonzero()[0])
+    state[layout.status, pixel] = CONVERGED
+    after = further(state)
+    known = torch.arange(layout.rows) != layout.damping
+    assert torch.equal(after[known, pixel], state[known, pixel])
+    others = torch.arange(PIXELS) != pixel
+    assert torch.equal(after[:, others], unhindered[:, others])
+
+
+def test_where_no_step_is_short_enough_there_is_an_end(under_way):
+    layout, state, further = under_way
+    state[layout.cost, 4] = 0.0  # as if nothing were lower
+    state[layout.damping, 4] = MOST_DAMPING
+    after = further(state)
+    assert after[layout.status, 4] == CONVERGED
+    assert (after[layout.status] == ACTIVE).sum() == PIXELS - 1
 
 
 def test_the_problem_goes_to_it_where_it_is_wanted(well_posed, monkeypatch):
