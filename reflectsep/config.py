@@ -131,8 +131,18 @@ class FitSettings:
     scattering: Literal["measured", "none", "unknown"] = setting(
         "measured", "from the sweeps, left out (Lin & Lee), or fitted (7 unknowns a pixel)"
     )
-    n_s: float | None = setting(None, "exponent of the lobe; null: fitted", above=0.0, at_most=1000.0)
-    refine_n_d: bool = setting(False, "fit n_d as a fifth global")
+    lobe: Literal["ggx", "power"] = setting("ggx", "highlight of GGX microfacets, or the paper's power of a cosine")
+    shading: Literal["fitted", "lambert"] = setting(
+        "fitted", "Fresnel's losses and soft shadow edges are fitted, or the paper's clamp alone"
+    )
+    n_s: float | None = setting(None, "exponent of the lobe; null: fitted", above=0.0, at_most=5000.0)
+    f: float | None = setting(
+        None,
+        "share of scattered light that has forgotten the normal; null: fitted, 1: the paper, 0: Lin & Lee",
+        at_least=0.0,
+        at_most=1.0,
+    )
+    refine_n_d: bool = setting(False, "fit n_d too")
     alpha_sd: float = setting(
         0.0,
         "uncertainty of stated alphas (directions in radians, relative intensities) within which they are refined by "
@@ -140,29 +150,17 @@ class FitSettings:
         at_least=0.0,
         at_most=1.0,
     )
-    weights: Literal["paper", "noise"] = setting("paper", "of Eq. 22: the two lambdas, or each picture's noise")
-    lambda_basis: float = setting(1.0, "weight of the basis pictures (lambda_1)", above=0.0)
-    lambda_other: float = setting(2.0, "weight of the other pictures (lambda_2)", above=0.0)
-    scattering_sd: float = setting(
-        0.03, "relative uncertainty within which measured scattering is refined; 0: held", at_least=0.0, at_most=1.0
-    )
+    lambda_basis: float = setting(1.0, "weight of the basis pictures in Eq. 22", above=0.0)
+    lambda_other: float = setting(1.0, "weight of the other pictures; 2 in the paper", above=0.0)
     robust: Literal["huber", "none"] = setting("huber", "loss that weighs cast shadows down")
-    lobe: Literal["auto", "ggx", "single"] = setting(
-        "auto",
-        "a cosine's power or GGX's, soft shadow edges where they pay; or the paper's formula alone",
-    )
-    max_iterations: int = setting(20, "limit of every joint solve", at_least=1)
+    prior: Literal["auto", "none"] = setting("auto", "highlights of one height and alike in neighbours, or no prior")
+    max_iterations: int = setting(30, "limit of every solve", at_least=1)
     tolerance: float = setting(
         1e-6, "relative change of the cost that ends a pixel's iterations", above=0.0, at_most=1.0
     )
-    globals_pixels: int = setting(300, "pixels that start the globals", at_least=8)
     chunk: int = setting(4096, "pixels handled at once; bounds the memory", at_least=1)
-    prior: Literal["auto", "none"] = setting("auto", "prior on the lobe, its strength from the data, or none")
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
     device: Literal["cpu", "cuda"] = setting("cpu", "where chunks of pixels are solved; for cuda a larger fit.chunk")
-    compile: Literal["auto", "always", "never"] = setting(
-        "auto", "the solver compiled by a C++ compiler: where the object is large, always, or never"
-    )
     share: float = setting(
         1.0, "of the object that is fitted, in squares strewn evenly: for globals to hold", above=0.0, at_most=1.0
     )

@@ -289,12 +289,8 @@ class Learnt:
     covariance: tuple[tuple[float, ...], ...]
     noise: float
     """Standard deviation of one residual, in the capture's units."""
-    shape: float
-    """1 / standard deviation of log B about its geometric value."""
-    height: float
-    """Highest peak of the lobe that is believed."""
-    scales: tuple[tuple[float, float], ...] = ()
-    """Width in pixels of each neighbourhood that had a say in the lobes, and the spread of lobes about it."""
+    smooth: tuple[float, float] | None = None
+    """Width in pixels of the neighbourhood that has a say in a pixel's lobe, and the spread of lobes about it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,19 +300,23 @@ class Fit:
     a: Float[Tensor, "3"]
     n_s: Float[Tensor, ""]
     n_d: Float[Tensor, ""]
+    f: Float[Tensor, ""]
+    """Share of the scattered light that has forgotten the normal; 1 in the paper, 0 in Lin & Lee."""
     softness: Float[Tensor, ""]
-    """Width of the shadow's edge over the mean scattering root; 0: hard, the paper's formula."""
-    crest: Float[Tensor, ""]
-    """The lobe's argument in the mirror direction, where the lobe is that of GGX; 0: the paper's power."""
+    """Softness of a shadow's edge, in units of the cosine; 0: hard, the paper's formula."""
+    fresnel: Float[Tensor, ""]
+    """Share of Schlick's Fresnel term that the body obeys; 0: none, the paper's formula."""
+    ggx: bool
+    """Whether the lobe is that of GGX microfacets; else the paper's power."""
     global_names: tuple[str, ...]
     """Order of `covariance`: the globals that were free."""
     covariance: Float[Tensor, "globals globals"]
     d: Float[Tensor, "3 channels height width"]
     """D_k^(1/n_d), negative where the patch faces away from basis light k."""
     s: Float[Tensor, "lights channels height width"]
-    B: Float[Tensor, "channels height width"]
+    B: Float[Tensor, "height width"]
     d_sd: Float[Tensor, "3 channels height width"]
-    B_sd: Float[Tensor, "channels height width"]
+    B_sd: Float[Tensor, "height width"]
     residual: Float[Tensor, "lights channels height width"]
     """Picture minus model, in the capture's units."""
     intensity: Float[Tensor, "lights"]

@@ -29,7 +29,7 @@ class Flag(IntFlag):
     NOT_CONVERGED = 1 << 7
     """The solver stopped at its iteration limit."""
     AMBIGUOUS = 1 << 8
-    """Two solutions of nearly equal cost; neighbours and the prior chose."""
+    """Two solutions of nearly equal cost; only results of versions before 0.2 have it."""
     ATTACHED_SHADOW = 1 << 9
     """Faces away from at least one basis light (d < 0 there)."""
     SHADOW_OR_OUTLIER = 1 << 10
@@ -38,6 +38,8 @@ class Flag(IntFlag):
     """Below the noise floor in every basis picture."""
     MOVED_OUT = 1 << 12
     """Outside the frame of at least one picture once the camera's drift is undone; the pixel is not fitted."""
+    FAILED = 1 << 13
+    """The solver found no finite cost, or no step that lowers it."""
 
 
 WORDS: Mapping[str, str] = {
@@ -54,6 +56,7 @@ WORDS: Mapping[str, str] = {
     "SHADOW_OR_OUTLIER": "a picture disagrees here: cast shadow or inter-reflection",
     "UNDEREXPOSED": "below the noise in every basis picture",
     "MOVED_OUT": "out of the frame of a picture once the camera's drift is undone",
+    "FAILED": "the solver failed here",
 }
 """What each flag means, for people."""
 

@@ -21,7 +21,7 @@ from reflectsep.scatter.options import HeldSweeps
 SAME = 1e-4
 """Components of stated light vectors and alphas that differ by less are alike; a result holds single precision."""
 SAME_EXPOSURE = 0.01
-ALIKE = ("scattering", "lobe", "dtype")
+ALIKE = ("scattering", "lobe", "shading", "dtype")
 """Settings of the fit that another fit's globals depend on."""
 
 
@@ -198,9 +198,7 @@ def _handed(folder: Path, document: Mapping[str, Any], use: Literal["held", "sta
         order=order,
         covariance=tuple(numbers(row) for row in covariance["values"]),
         noise=positive(known["noise"]),
-        shape=numbers([known["shape"]])[0],
-        height=positive(known["height"]),
-        scales=tuple((positive(width), positive(spread)) for width, spread in known["scales"]),
+        smooth=None if known["smooth"] is None else (positive(known["smooth"][0]), positive(known["smooth"][1])),
     )
     basis = [str(name) for name in document["basis"]]
     names = (*basis, *(str(name) for name in document["lights"] if name not in basis))

@@ -23,6 +23,7 @@ from reflectsep.data import Capture, PhotometricStack, Scattering
 from reflectsep.errors import FitError, LightError, ReflectsepError, SettingsError, SweepError
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
+from reflectsep.fit.sample import strewn_squares
 from reflectsep.handed import learnt_document, read_handed
 from reflectsep.io import calibration as calibration_file
 from reflectsep.io.capture import load_capture
@@ -40,8 +41,6 @@ from reflectsep.workload import Counts, reading, solving
 
 __all__ = ["fit", "load", "load_capture"]
 
-SQUARE_PX = 24
-"""Side of the squares in which a share of the object is fitted: windows of neighbours reach 9 pixels."""
 PREVIEW_PIXELS = 1 << 22
 """A preview is a quick look: larger pictures are halved."""
 
@@ -164,19 +163,17 @@ def separated(
 
 
 def strewn(stack: PhotometricStack, share: float) -> PhotometricStack:
-    """The stack with only a share of its object, in squares of `SQUARE_PX` that lie evenly over it.
+    """The stack with only a share of its object, in squares that lie evenly over it.
 
-    Whole squares, for what is taken from the neighbourhood. Which: those where a plane of two irrational slopes, modulo
-    1, is below `share` (additive recurrence; Roberts 2018), so that neither rows nor columns are preferred.
+    Whole squares, for what is taken from the neighbourhood; see `strewn_squares`.
 
     Raises:
         FitError: no pixel of the object is in them.
     """
     if share >= 1.0:
         return stack
-    rows, columns = (torch.arange(length) // SQUARE_PX for length in stack.mask.shape)
-    place = (0.7548776662 * rows[:, None].double() + 0.5698402910 * columns.double()) % 1.0
-    mask = stack.mask & (place < share)
+    height, width = stack.mask.shape
+    mask = stack.mask & strewn_squares((height, width), share)
     if not bool(mask.any()):
         raise FitError(f"fit.share={share:g}: no pixel of the object is in the squares that are to be fitted")
     return dataclasses.replace(stack, mask=mask)

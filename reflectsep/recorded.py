@@ -17,7 +17,7 @@ from reflectsep.progress import Progress
 from reflectsep.report.figures import HeldOut
 from reflectsep.separation import Separation
 
-LIN_LEE: dict[str, Any] = {"scattering": "none", "lobe": "single", "globals_from": None}
+LIN_LEE: dict[str, Any] = {"scattering": "none", "globals_from": None}
 """Settings of the fit that make it Lin & Lee's model, whose globals are its own."""
 
 

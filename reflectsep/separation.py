@@ -3,11 +3,11 @@
 Parameters are for lights of unit intensity; a picture is its light's intensity times the model, because light adds
 in radiance. Components, for basis light k of intensity t_k:
 
-    off-specular    t_k lobe(a_k + B d_k)         local diffuse   t_k (d_k)_+ ^ n_d
-    scattering      t_k (s_k)_+ ^ n_d             whole diffuse   t_k pos(d_k + s_k) ^ n_d
+    off-specular    t_k F(a_k + B m_k)            local diffuse   t_k (d_k)_+ ^ n_d
+    scattering      t_k (s_k)_+ ^ n_d             whole diffuse   t_k (q T(d_k + s_k)) ^ n_d
 
-For n_d != 1 the whole diffuse is not the sum of its two parts. Scattering is written as it was measured; inside the
-model it goes on below zero beyond the edge of an attached shadow, so there too the parts do not add up.
+with F, T, q and m as in `reflectsep.model`. The whole diffuse is not quite the sum of its two parts: for n_d != 1 by the
+power, and otherwise by what T adds at the edge of a shadow and takes at grazing angles.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import ResultError
 from reflectsep.flags import count
 from reflectsep.io.result import read_result, write_result
-from reflectsep.model import Globals, edge_width, lobe, lobe_argument, positive_power, reflectance
+from reflectsep.model import Globals, length, lobe_of, lobe_vector, positive_power, reflectance
 from reflectsep.room import cuts, empty, room_beside, stacked
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
@@ -57,14 +57,18 @@ class Separation:
     a: Float[Tensor, "3"]
     n_s: Float[Tensor, ""]
     n_d: Float[Tensor, ""]
+    f: Float[Tensor, ""]
+    """Share of the scattered light that has forgotten the normal: the lobe turns with d + (1 - f) s."""
     softness: Float[Tensor, ""]
-    crest: Float[Tensor, ""]
+    fresnel: Float[Tensor, ""]
+    ggx: bool
+    """Whether the lobe is that of GGX microfacets; else the paper's power."""
     d: Float[Tensor, "3 channels height width"]
     s: Float[Tensor, "3 channels height width"]
-    B: Float[Tensor, "channels height width"]
+    B: Float[Tensor, "height width"]
     d_sd: Float[Tensor, "3 channels height width"]
     s_sd: Float[Tensor, "3 channels height width"]
-    B_sd: Float[Tensor, "channels height width"]
+    B_sd: Float[Tensor, "height width"]
     specular: Float[Tensor, "3 channels height width"]
     local_diffuse: Float[Tensor, "3 channels height width"]
     scattering: Float[Tensor, "3 channels height width"]
@@ -74,8 +78,8 @@ class Separation:
     """Picture minus specular: keeps what the model does not explain; the whole diffuse where the picture is clipped."""
     residual: Float[Tensor, "lights channels height width"]
     ceiling: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(math.inf))
-    """Largest argument of the lobe when relighting: that of a highlight `PEAK_FACTOR` times the brightest that the fit
-    found in its own pictures. Where no picture saw the lobe, nothing else bounds it."""
+    """Largest |w| of a lobe when relighting: that of a highlight `PEAK_FACTOR` times as high as those of most pixels.
+    Where no picture saw the highlight, nothing else bounds it."""
     document: Mapping[str, Any]
     """What `separation.json` says beside the globals: settings, versions, timings, statistics."""
 
@@ -95,7 +99,29 @@ class Separation:
     def globals(self) -> Globals:
         """The shared parameters as the model takes them."""
         n_d = 1.0 if float(self.n_d) == 1.0 else self.n_d
-        return Globals(a=self.a, n_s=self.n_s, n_d=n_d, softness=self.softness, crest=self.crest)
+        return Globals(
+            a=self.a,
+            n_s=self.n_s,
+            n_d=n_d,
+            f=self.f,
+            softness=self.softness,
+            fresnel=self.fresnel,
+            ggx=self.ggx,
+            M=self.M,
+        )
+
+    @property
+    def M(self) -> Float[Tensor, "3 3"]:  # noqa: N802  (the symbol of `reflectsep.model`)
+        """Inverse of the basis lights' directions; the identity where they are unknown."""
+        if self.light_vectors is None:
+            return torch.eye(3, dtype=self.d.dtype)
+        basis = self.light_vectors[:3].double()
+        return torch.linalg.inv(basis / basis.norm(dim=-1, keepdim=True)).to(self.d.dtype)
+
+    @property
+    def lobe_vector(self) -> Float[Tensor, "3 height width"]:
+        """A + B m of every pixel: the lobe's argument under the basis lights, zero outside the mask."""
+        return lobe_vector(self.d, self.s, self.B, self.globals) * self.mask
 
     def relight(self, alpha: Float[Tensor, "*lights 3"]) -> Float[Tensor, "*lights channels height width"]:
         """Pictures under lights sum_k alpha_k L_k (Eqs. 15 and 21), linear, in the capture's units.
@@ -115,11 +141,8 @@ class Separation:
             raise ValueError("alpha is not finite")
         lead = alpha.shape[:-1]
         unit, intensity = self.unit_mix(alpha.reshape(-1, 3).to(self.d))
-        d, s = self.d.permute(2, 3, 1, 0), self.s.permute(2, 3, 1, 0)
-        B = self.B[0] if len(self.B) == 1 else self.B.mean(0)
-        width = edge_width(s, self.softness)
-        pictures = reflectance(d, B, self.globals, s=s @ unit.mT, alpha=unit, width=width, ceiling=float(self.ceiling))
-        pictures = pictures.permute(3, 2, 0, 1) * intensity[:, None, None, None] * self.mask
+        pictures = reflectance(self.d, self.B, self.globals, s=self.s, alpha=unit, ceiling=self.ceiling)
+        pictures = pictures * intensity[:, None, None, None] * self.mask
         return pictures.reshape(*lead, *pictures.shape[1:])
 
     def rows(self, rows: slice) -> Separation:
@@ -163,8 +186,7 @@ class Separation:
         for prefix, stack in (("d", self.d), ("s", self.s), ("d_sd", self.d_sd), ("s_sd", self.s_sd)):
             stem, tail = prefix.partition("_")[0], prefix.partition("_")[1] + prefix.partition("_")[2]
             planes |= picture_channels(tuple(f"{stem}{k}{tail}" for k in ranks), stack, channels)
-        planes |= picture_channels(("B",), self.B[None], channels)
-        planes |= picture_channels(("B_sd",), self.B_sd[None], channels)
+        planes["B"], planes["B_sd"] = self.B.numpy(), self.B_sd.numpy()
         planes["flags"] = self.flags.numpy().astype(np.uint32)
         planes["mask"] = self.mask.numpy().astype(np.uint32)
         return planes
@@ -176,7 +198,8 @@ class Separation:
             lights[name] = {"alpha": self.alpha[i].tolist()}
             if vectors is not None:
                 lights[name]["vector"] = vectors[i].tolist()
-        shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "softness", "crest")}
+        shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "f", "softness", "fresnel")}
+        shared["lobe"] = "ggx" if self.ggx else "power"
         shared |= {"ceiling": self.ceiling.tolist()} if bool(self.ceiling.isfinite()) else {}
         return {
             **self.document,
@@ -219,8 +242,10 @@ def separate(
         a=fit.a,
         n_s=fit.n_s,
         n_d=fit.n_d,
+        f=fit.f,
         softness=fit.softness,
-        crest=fit.crest,
+        fresnel=fit.fresnel,
+        ggx=fit.ggx,
         d=fit.d,
         s=fit.s[:3],
         B=fit.B,
@@ -246,15 +271,16 @@ def separate(
 
 
 def lobe_ceiling(separation: Separation) -> Float[Tensor, ""]:
-    """`Separation.ceiling` from the lights of the fit, so that their own pictures stay as they are."""
-    unit, _ = separation.unit_mix(separation.alpha)
-    highest = separation.a.new_zeros(())
+    """`Separation.ceiling`: from the 99 % quantile of |w|, so that a few wrong pixels do not set it."""
+    sizes = []
     for rows in bands(separation.mask):
         part = separation.rows(rows)
-        d, B = part.d.permute(2, 3, 1, 0)[part.mask], part.B.mean(0)[part.mask]
-        for mix in unit if len(d) else ():
-            highest = torch.maximum(highest, lobe_argument(d, B, part.a, mix[None]).amax())
-    return PEAK_FACTOR ** (1.0 / separation.n_s) * highest
+        sizes.append(length(part.M, part.lobe_vector)[part.mask][:: max(1, separation.mask.numel() >> 20)])
+    found = torch.cat(sizes)
+    if len(found) == 0:
+        return separation.a.new_tensor(math.inf)
+    high = found.kthvalue(max(1, int(0.99 * len(found)))).values
+    return PEAK_FACTOR ** (1.0 / separation.n_s) * high
 
 
 def bands(mask: Bool[Tensor, "height width"]) -> Iterator[slice]:
@@ -276,9 +302,8 @@ def _components(separation: Separation, stack: PhotometricStack, measured: Tenso
     """Components of some of the picture's rows."""
     part = separation.rows(rows)
     t = part.intensity[:, None, None, None]
-    d, B = part.d.permute(2, 3, 1, 0), part.B.mean(0)
-    u = lobe_argument(d, B, part.a, torch.eye(3)).permute(2, 0, 1)[:, None]
-    specular = (t * lobe(u, part.n_s, part.crest) * part.mask).expand_as(part.d)
+    shine = lobe_of(lobe_vector(part.d, part.s, part.B, part.globals), part.globals, torch.eye(3), part.ceiling)
+    specular = (t * shine[:, None] * part.mask).expand_as(part.d)
     diffuse = part.relight(torch.eye(3)) - specular
     pictures = stack.images[:3, :, rows]
     unknown = stack.saturated[:3, :, rows] | ~pictures.isfinite() | ~part.mask
@@ -291,11 +316,14 @@ def _components(separation: Separation, stack: PhotometricStack, measured: Tenso
     }
 
 
-def extensions(softness: float, crest: float) -> str:
-    """Which extensions of the paper's formula a result has, in a sentence; empty where it has none."""
-    edges = ["soft shadow edges lowered the cost and were kept"] if softness > 0 else []
-    lobe_kind = ["the lobe is that of GGX microfacets, as asked for"] if crest > 0 else []
-    return "; ".join([*edges, *lobe_kind])
+def extensions(separation: Separation | Fit) -> str:
+    """What a result has beyond the paper's formula, in a sentence; empty where it has nothing."""
+    f, e, k = float(separation.f), float(separation.softness), float(separation.fresnel)
+    parts = [f"GGX lobe of roughness {1.0 / math.sqrt(1.0 + float(separation.n_s)):.2f}"] if separation.ggx else []
+    parts += [f"the lobe turns with d + {1 - f:.2f} s"] if f < 1 else []
+    parts += [f"shadow edges soft by {e:.2f} of the cosine"] if e > 0.02 else []
+    parts += [f"{100 * k:.0f} % of Fresnel's losses in the body"] if k > 0 else []
+    return "; ".join(parts)
 
 
 def load(folder: Path | str) -> Separation:
@@ -331,14 +359,16 @@ def from_layers(folder: Path, document: Mapping[str, Any]) -> Separation:
     maps = {
         name: stack(parameters, tuple(f"{name[0]}{k}{name[1:]}" for k in "123")) for name in ("d", "s", "d_sd", "s_sd")
     }
-    maps |= {name: stack(parameters, (name,))[0] for name in ("B", "B_sd")}
+    maps |= {name: torch.from_numpy(parameters[name].astype(np.float32)) for name in ("B", "B_sd")}
     maps["mask"] = torch.from_numpy(parameters["mask"].astype(np.int64)) > 0
     maps["flags"] = torch.from_numpy(parameters["flags"].astype(np.int32))
     del parameters
     maps |= {name: stack(layers[f"{name}.exr"](), basis) for name in COMPONENTS}
     maps["residual"] = stack(layers["residual.exr"](), names)
     vectors = [lights[name].get("vector") for name in names]
-    shared = {key: torch.tensor(document["globals"][key], dtype=torch.float32) for key in document["globals"]}
+    given = dict(document["globals"])
+    ggx = {"ggx": True, "power": False}[given.pop("lobe")]
+    shared = {key: torch.tensor(given[key], dtype=torch.float32) for key in given}
     if any(not math.isfinite(v) for tensor in shared.values() for v in tensor.flatten().tolist()):
         raise ValueError("a global is not finite")
     ours = {"format", "checksums", "basis", "lights", "view", "globals", "flags"}
@@ -348,6 +378,7 @@ def from_layers(folder: Path, document: Mapping[str, Any]) -> Separation:
         light_vectors=None if None in vectors else torch.tensor(vectors, dtype=torch.float32),
         view=torch.tensor(document["view"], dtype=torch.float32),
         **shared,
+        ggx=ggx,
         **maps,
         document={key: value for key, value in document.items() if key not in ours},
     )

@@ -84,7 +84,7 @@ def describe(  # noqa: PLR0913  (every stage has its say)
     if alignment is not None:
         document["alignment"] = alignment.document(capture)
         warnings.extend(alignment.warnings)
-    kept = extensions(float(fitted.softness), float(fitted.crest))
+    kept = extensions(fitted)
     if kept:
         document["extensions"] = kept
     document["warnings"] = warnings
@@ -147,7 +147,7 @@ def summary(separation: Separation, *, full: bool = False) -> str:
         if document.get("region"):
             x, y, w, h = document["region"]
             lines.append(f"  region    {w} x {h} pixels of the capture's pictures, from column {x}, row {y}")
-        kept = extensions(float(separation.softness), float(separation.crest))
+        kept = extensions(separation)
         lines += [f"  beyond    {kept}"] if kept else []
         for name, entry in document.get("alpha_refined", {}).items():
             said = ", ".join(

@@ -37,7 +37,7 @@ LEAST_SHARE = 0.02
 LEAST_OVERLAP_PX = 8
 """Windows of neighbours and filled holes reach about as far."""
 LEAST_SAY = 1e-6
-GLOBALS = ("a", "n_s", "n_d", "softness", "crest")
+GLOBALS = ("a", "n_s", "n_d", "f", "softness", "fresnel")
 
 
 @dataclass(frozen=True, kw_only=True)

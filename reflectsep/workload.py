@@ -12,17 +12,12 @@ from dataclasses import dataclass
 from reflectsep.data import Capture
 from reflectsep.estimate import Part
 from reflectsep.fit.options import FitOptions
+from reflectsep.fit.sample import SAMPLE
 
-SOLVING_US = {
-    "pixels": (195,),
-    "joint fit": (135,),
-    "shadow edges": (110,),
-    "neighbourhood": (70, 95),
-    "smooth lobes": (55, 48, 42, 42, 42, 42),
-}
-"""Microseconds a pixel of a grey fit of few lights; `_effort` says how it grows with what a pixel has."""
-GLOBALS_S = (3.0, 2.6)
-"""Of 300 pixels of a grey fit of few lights; it grows with the power 1.7 of `_effort`."""
+PIXEL_US = 60
+"""Microseconds a pixel of a grey fit of few lights, all of its rounds; `_effort` says how it grows."""
+GLOBALS_US = 900
+"""Of a pixel of the sample that the globals are fitted to."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,24 +80,14 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
 def solving(counts: Counts, options: FitOptions, *, swept: bool) -> list[Part]:
     """Parts of the fit itself."""
     effort = _effort(counts)
-    globals_s = [s * effort**1.7 * options.globals_pixels / 300 for s in GLOBALS_S]
-    if options.held is not None:
-        globals_s = []
-    elif options.prior != "auto":
-        globals_s = globals_s[:1]
-    parts = [Part(name="globals", label="globals", expected_s=s, steps="even") for s in globals_s]
-    wanted = ["pixels"]
-    if options.method == "joint":
-        wanted.append("joint fit")
-        if options.lobe != "single" and swept and options.held is None:
-            wanted.append("shadow edges")
-        if swept:
-            wanted.append("neighbourhood")
-        if options.prior == "auto":
-            wanted.append("smooth lobes")
-    for name in wanted:
-        parts += [Part(name=name, label=name, expected_s=1e-6 * us * effort * counts.pixels) for us in SOLVING_US[name]]
-    return parts
+    parts = []
+    if options.held is None:
+        sampled = min(counts.pixels, SAMPLE)
+        parts.append(
+            Part(name="globals", label="globals", expected_s=1e-6 * GLOBALS_US * effort * sampled, steps="even")
+        )
+    seconds = 1e-6 * PIXEL_US * effort * counts.pixels * (1.0 if swept else 0.8)
+    return [*parts, Part(name="pixels", label="pixels", expected_s=seconds, steps="even")]
 
 
 def reporting(counts: Counts, sweeps: int) -> list[Part]:

@@ -51,14 +51,16 @@ def _nominal_split(d: Tensor, alpha: Tensor, noise: float, bright: float) -> tup
         a=torch.full((3,), NOMINAL_A, dtype=torch.float64),
         n_s=torch.tensor(NOMINAL_N_S, dtype=torch.float64),
         n_d=1.0,
+        f=torch.tensor(1.0, dtype=torch.float64),
         softness=torch.tensor(0.0, dtype=torch.float64),
-        crest=torch.tensor(0.0, dtype=torch.float64),
+        fresnel=torch.tensor(0.0, dtype=torch.float64),
+        ggx=False,
+        M=torch.eye(3, dtype=torch.float64),
     )
 
     def pictures(theta: Tensor) -> Tensor:
-        still = torch.zeros(1, len(alpha), dtype=theta.dtype)
-        edge = torch.zeros(1, 1, dtype=theta.dtype)
-        return reflectance(theta[None, :3], theta[3], shared, s=still, alpha=alpha, width=edge)[0]
+        d = theta[:3, None]
+        return reflectance(d, theta[3], shared, s=torch.zeros_like(d), alpha=alpha)[:, 0]
 
     theta = torch.cat([d, B[:, None]], 1)
     jacobian = torch.func.vmap(torch.func.jacfwd(pictures))(theta)  # (pixels, lights, 4)

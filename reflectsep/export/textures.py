@@ -1,7 +1,7 @@
 """Textures for a renderer that knows a diffuse colour, a highlight and a normal, and no more.
 
 From the roots r_k = d_k + s_k under basis lights of unit vectors L_k, g with L_k . g = r_k: a Lambertian surface of
-albedo |g| and normal g / |g|. The lobe's root is linear in the light, u(L) = h . L with L_k . h = a_k + B d_k: at most
+albedo |g| and normal g / |g|. The lobe's root is linear in the light, u(L) = h . L with L_k . h = a_k + B m_k: at most
 |h|, which gives the highlight's peak. Around it u falls as the cosine of the angle to h. A power of it is a Phong lobe;
 its exponent for the half-vector is about 4 n_s, to which a microfacet width of alpha = sqrt(2 / (4 n_s + 2)) belongs
 (Walter, Marschner, Li and Torrance, 2007). A GGX lobe has alpha = 1 / sqrt(1 + n_s) itself (`model`). Renderers that
@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.model import lobe, positive_power
+from reflectsep.model import length, lobe, positive_power
 from reflectsep.separation import Separation
 from reflectsep.srgb import encoded
 
@@ -36,8 +36,8 @@ class Textures:
     alpha: float
     """Width of the microfacet distribution."""
     n_s: float
-    crest: float
-    """Of the lobe; 0: a Phong lobe."""
+    ggx: bool
+    """Whether the lobe is that of GGX microfacets; else a Phong lobe."""
     view: Float[Tensor, "3"]
 
     @property
@@ -60,19 +60,18 @@ def textures_of(separation: Separation, *, white: float) -> Textures:
     normal = torch.where(mask, normal, torch.tensor([0.0, 0.0, 1.0], dtype=normal.dtype)[:, None, None])
     n_d = float(separation.n_d)
     albedo = positive_power((g * normal[:, None]).sum(0), n_d) * intensity / white
-    w = separation.a.double()[:, None, None] + separation.B.mean(0).double() * separation.d.mean(1).double()
-    h = torch.einsum("ik,khw->ihw", solve, w).norm(dim=0).clamp(max=float(separation.ceiling))
-    n_s, crest = float(separation.n_s), separation.crest.double()
+    h = length(separation.M.double(), separation.lobe_vector.double()).clamp(max=float(separation.ceiling))
+    n_s = float(separation.n_s)
     whole = separation.diffuse.double().mean(0)
     share = separation.scattering.double().mean(0) / whole.clamp_min(1e-12)
     return Textures(
         base_colour=albedo * mask,
-        specular=(lobe(h, separation.n_s.double(), crest) * intensity / white * mask)[None],
+        specular=(lobe(h, h, separation.n_s.double(), separation.ggx) * intensity / white * mask)[None],
         normal=normal,
         scattering_colour=torch.where(mask & (whole > 1e-6 * white), share, 0.0).clamp(0.0, 1.0),
-        alpha=1.0 / math.sqrt(1.0 + n_s) if crest > 0 else math.sqrt(2.0 / (4.0 * n_s + 2.0)),
+        alpha=1.0 / math.sqrt(1.0 + n_s) if separation.ggx else math.sqrt(2.0 / (4.0 * n_s + 2.0)),
         n_s=n_s,
-        crest=float(crest),
+        ggx=separation.ggx,
         view=separation.view.double(),
     )
 
@@ -83,15 +82,14 @@ def rendered(textures: Textures, direction: Float[Tensor, "3"]) -> Float[Tensor,
     lambert = (N * L).sum(0).clamp_min(0.0)
     mirrored = 2.0 * (N * V).sum(0) * N - V
     cosine, n_s = (mirrored * L).sum(0), torch.tensor(textures.n_s, dtype=torch.float64)
-    crest = torch.tensor(float(textures.crest > 0), dtype=torch.float64)  # of a lobe of height 1
-    shine = lobe(cosine, n_s, crest) * (lambert > 0)
+    shine = lobe(cosine, torch.ones_like(cosine), n_s, textures.ggx) * (lambert > 0)
     return encoded(textures.base_colour * lambert + textures.specular * shine)
 
 
 def note(textures: Textures, white: float, inside_db: float, all_db: float) -> str:
     """What the textures are, and what they cannot carry."""
     formula, highlight = "sqrt(2 / (4 n_s + 2))", "a Phong highlight of exponent n_s"
-    if textures.crest > 0:
+    if textures.ggx:
         formula, highlight = "1 / sqrt(1 + n_s)", "a GGX highlight of that alpha"
     return f"""Textures of a separated object
 

@@ -1,88 +1,63 @@
-"""The whole diffuse root before anything is known of the lobe, and what it says of scattering in shadow.
+"""The whole diffuse root before anything is known of the lobe: robust least squares of b in I = max(A b, 0)^n_d.
 
-Robust least squares of b in I = pos(A b)^n_d over all pictures of a pixel: highlights and cast shadows are outliers,
-attached shadows are clamped inside the formula. b is a start value and a guide, never a result.
+Highlights and cast shadows are outliers, attached shadows are clamped inside the formula. b is where a fit starts.
 """
+
+from __future__ import annotations
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.kernel.linear import factorise, solve
-from reflectsep.model import signed_root
-from reflectsep.room import by_rows
-
-AT_ONCE = 1 << 12
-"""Pixels whose maps stay in the cache."""
-LIT_FRACTION = 0.4
-"""A basis light counts as fully lighting a patch where b_k exceeds this share of the largest of the three."""
+from reflectsep.model import mixed, signed_root
+from reflectsep.solve.linear import factorise, solve
 
 
 def robust_body(
-    images: Float[Tensor, "pixels channels lights"],
-    weight: Float[Tensor, "pixels channels lights"],
+    images: Float[Tensor, "lights channels pixels"],
+    sigma: float,
     alpha: Float[Tensor, "lights 3"],
     n_d: float,
     *,
-    iterations: int = 25,
-) -> Float[Tensor, "pixels channels 3"]:
-    """Signed whole diffuse root of the basis lights.
+    iterations: int = 15,
+) -> Float[Tensor, "3 channels pixels"]:
+    """Signed whole diffuse root of the basis lights, by reweighted least squares.
 
-    `weight` is 1 / standard deviation of every value. Values above the model are highlights and count less than
-    values below it, which are noise or cast shadows.
+    Values above the model are highlights and count less than values below it, which are noise or cast shadows.
+
+    Args:
+        images: for lights of unit intensity.
+        sigma: standard deviation of every value.
+        alpha: every light as a mix of the basis lights.
+        n_d: diffuse exponent.
+        iterations: of the reweighting.
     """
-
-    def of(cut: slice) -> Tensor:
-        return _robust_body(images[cut], weight[cut], alpha, n_d, iterations)
-
-    return by_rows(len(images), AT_ONCE, of)
-
-
-def _robust_body(images: Tensor, weight: Tensor, alpha: Tensor, n_d: float, iterations: int) -> Tensor:
-    # As maps (lights, channels, pixels), value by value: three unknowns are too few for matrices.
-    root, weight = (values.permute(2, 1, 0).contiguous() for values in (signed_root(images, n_d), weight))
-    relative = (weight / weight.amax(0).clamp_min(1e-30)).clamp_min(1e-6).square()
-    lit = 3.0 / weight.clamp_min(1e-30)
-    b = solve_weighted(root, relative, alpha)
+    root = signed_root(images, n_d).to(alpha.dtype)
+    weight = torch.ones_like(root)
+    b: Tensor | None = None
     for _ in range(iterations):
-        mixed = alpha[:, 0, None, None] * b[0] + alpha[:, 1, None, None] * b[1] + alpha[:, 2, None, None] * b[2]
-        residual = root - mixed.clamp_min(0.0)
+        found = solve_weighted(root, weight, alpha)
+        b = found if b is None else 0.5 * (b + found)
+        x = mixed(alpha, b)
         # In units of noise; the root's derivative is near 1 wherever n_d is.
-        size = residual * weight
+        size = (root - x.clamp_min(0.0)) / sigma
         trust = torch.where(size > 0, 1.5 / size.clamp_min(1.5), 4.0 / (-size).clamp_min(4.0))
         # A light behind the horizon has nothing to say unless the picture is lit.
-        active = (mixed > 0) | (root > lit)
-        b = 0.5 * b + 0.5 * solve_weighted(root, relative * trust * active, alpha)
-    return b.permute(2, 1, 0).contiguous()
+        weight = (trust * ((x > 0) | (root > 3.0 * sigma))).clamp_min(1e-6)
+    assert b is not None
+    return b
 
 
 def solve_weighted(
-    root: Float[Tensor, "lights channels pixels"], weight: Tensor, alpha: Float[Tensor, "lights 3"]
+    root: Tensor, weight: Tensor, alpha: Float[Tensor, "lights 3"]
 ) -> Float[Tensor, "3 channels pixels"]:
     """argmin_b sum_j weight_j (root_j - A_j b)^2, with a trace of a ridge."""
-    upper = [(i, j) for i in range(3) for j in range(i, 3)]
-    system, right = [torch.zeros_like(root[0]) for _ in upper], [torch.zeros_like(root[0]) for _ in range(3)]
-    for A, w, value in zip(alpha.tolist(), weight, root, strict=True):
-        for entry, (i, j) in zip(system, upper, strict=True):
-            entry.add_(w, alpha=A[i] * A[j])
-        weighted = w * value
-        for entry, A_k in zip(right, A, strict=True):
-            entry.add_(weighted, alpha=A_k)
-    largest = torch.maximum(torch.maximum(system[0], system[3]), system[5]).clamp_min(1e-12)
-    return torch.stack(solve(factorise(system, [1e-6 * largest] * 3), right))
-
-
-def extend_into_shadow(
-    s_basis: Float[Tensor, "pixels channels 3"], body: Float[Tensor, "pixels channels 3"]
-) -> Float[Tensor, "pixels channels 3"]:
-    """Signed scattering root: as measured where the patch is lit, going on in proportion to `body` beyond the edge.
-
-    What a shadowed patch scatters is measured but is no linear function of the light, so mixing it by alpha would
-    light the shadow under every other light. Beyond the edge the signed root keeps the share of scattered light that
-    the patch shows under the lights that do reach it.
-    """
-    lit = body.clamp_min(0.0)
-    share = (s_basis * lit).sum(-1, keepdim=True) / lit.square().sum(-1, keepdim=True).clamp_min(1e-12)
-    brightest = body.amax(-1, keepdim=True).clamp_min(1e-9)
-    weight = (body / (LIT_FRACTION * brightest)).clamp(0.0, 1.0)
-    return weight * s_basis + (1.0 - weight) * share.clamp(0.0, 1.0) * body
+    system = root.new_zeros(3, 3, *root.shape[1:])
+    for k in range(3):
+        for i in range(k + 1):
+            system[k, i] = torch.tensordot(alpha[:, k] * alpha[:, i], weight, 1)
+    ridge = 1e-6 * system.diagonal(dim1=0, dim2=1).amax(-1).clamp_min(1e-12)
+    right = torch.tensordot(alpha.mT, weight * root, 1)
+    shape = right.shape
+    factor = factorise(system.flatten(2), ridge.flatten().expand(3, -1))
+    return solve(factor, right.flatten(1)).view(shape)

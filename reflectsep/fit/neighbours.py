@@ -1,180 +1,168 @@
-"""What the pixels around a pixel say: smooth maps with their scatter, and lobes handed on from neighbour to neighbour.
+"""What the pixels around say of a pixel's lobe.
 
-About one pixel in a hundred has two minima of nearly equal cost, one wrong. Smoothing would blur the ninety-nine;
-instead a pixel is offered its neighbours' lobe as a start, and keeps whichever of its minima costs least. What the
-neighbours would have a pixel be is a regression over them that leaves the pixel itself out.
+The lobe's vector v = B m / 2 C_1 is (N.V)(N.L_k) on an ideal surface: a matter of shape alone, whatever the albedo, and
+surfaces are smooth. What a pixel's own pictures say of v is a mean mu and a covariance Sigma (the block's Gauss-Newton
+matrix; what the neighbours had said is taken off first). A neighbour's v is that of the pixel up to a spread t:
+
+    Lambda_q = (Sigma_q + t^2)^-1,     v0 = (sum_q k Lambda_q)^-1 sum_q k Lambda_q mu_q,
+    precision of v0 = ((sum_q k Lambda_q)^-1 + t^2)^-1
+
+with k a Gaussian about the pixel without its centre. Pixels that see the highlight well inform those that do not. The
+width of k and the spread t are those under which the neighbours foretell mu best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn.functional import conv2d, pad, unfold
+from torch.nn import functional as nnf
 
-from reflectsep.fit.chunks import in_chunks
-from reflectsep.kernel.linear import factorise, packed_at, solve
-from reflectsep.room import rows
+from reflectsep.fit.problem import UPPER, Neighbours, PixelProblem, globals_of, log_size
+from reflectsep.room import empty
+from reflectsep.solve.linear import factorise, solve
 
-MAD_TO_SD = 1.4826
-PIXELS_OF_WINDOWS = 1 << 16
-PIXELS_OF_A_BAND = 1 << 18
-"""Of the frame, at once: of a quadratic surface some hundred megabytes are in between."""
-QUADRATIC = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-"""Powers of x and y of a quadratic surface."""
-
-
-def to_map(values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"]) -> Tensor:
-    """Values of the mask's pixels as pictures (channels, height, width), zero elsewhere."""
-    picture = values.new_zeros(values.shape[1], *mask.shape)
-    picture[:, mask] = values.T
-    return picture
+WIDTHS_PX = (1.0, 1.5, 2.5)
+SPREADS = (0.01, 0.03, 0.1)
+"""Of v, which is 1 where a surface faces the viewer and the light."""
+FAINT = 1e-2
+"""Precision, of a spread of 10, that every pixel has without neighbours."""
+OUTLIER = 25.0
+"""Squared distance, in standard deviations, beyond which a pixel no longer speaks against a smoothness."""
 
 
-def smooth(
-    values: Float[Tensor, "pixels channels"],
-    weight: Float[Tensor, "pixels"],
-    mask: Bool[Tensor, "height width"],
-    sigma_px: float,
-) -> Float[Tensor, "pixels channels"]:
-    """Gaussian mean over the pixels of the mask, each counted by its weight (normalised convolution)."""
-    reach = max(1, round(3 * sigma_px))
-    window, sigma = (2 * reach + 1, 2 * reach + 1), (sigma_px, sigma_px)
-    blurred = lambda p: gaussian_blur2d(p[None], window, sigma, "constant")[0]  # noqa: E731
+@dataclass(frozen=True)
+class Messages:
+    """What each pixel's own pictures say of its lobe's vector."""
 
-    def mean(pixels: slice, part: Tensor, wanted: Tensor) -> Tensor:
-        total = blurred(to_map(values[pixels] * weight[pixels, None], part))
-        count = blurred(to_map(weight[pixels, None], part))
-        return (total / count.clamp_min(1e-12))[:, part].T[wanted]
-
-    return in_bands(mask, reach, PIXELS_OF_A_BAND, mean)
+    mean: Float[Tensor, "3 pixels"]
+    covariance: Float[Tensor, "6 pixels"]
+    """Upper triangle, row by row."""
 
 
-def neighbourhood(
-    values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"], radius: int
-) -> Float[Tensor, "pixels channels window"]:
-    """Values of the window about every pixel, the pixel itself left out; NaN where the mask ends."""
-    picture = to_map(values, mask)
-    picture = torch.where(mask, picture, torch.nan)
-    side = 2 * radius + 1
-    window = unfold(pad(picture[:, None], (radius,) * 4, value=torch.nan), side)
-    window = torch.cat([window[:, : side * side // 2], window[:, side * side // 2 + 1 :]], 1)
-    return window[:, :, mask.flatten()].permute(2, 0, 1)
+def messages(problem: PixelProblem, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> Messages:
+    """What the pictures say of every pixel's lobe vector, without what the neighbours said before."""
+    at = problem.normal(local, shared)
+    d, B = problem.unpacked(local)
+    g, obs = globals_of(shared, problem.obs), problem.obs
+    per = 0.5 / log_size(shared, obs).exp()
+    v = per * B * (d + (1.0 - g.f) * obs.s[:3]).mean(1)
+    # dv = per (B / C sum_c dd_c + B m dlog B)
+    slope = local.new_zeros(len(local), 3, len(B))
+    own = slope[:-1].view(3, obs.channels, 3, -1)
+    for k in range(3):
+        own[k, :, k] = per * B / obs.channels
+    slope[-1] = v
+    V = at.V
+    if problem.neighbours is not None:
+        # Take their rows off again: R^T R in the space of v.
+        precision = problem.neighbours.precision()
+        pull = torch.einsum("ijn,pjn->pin", precision, slope)
+        V = V - torch.einsum("pin,qin->pqn", slope, pull)
+    scale = V.diagonal(dim1=0, dim2=1).mT
+    firm = 1e-9 * scale.abs().amax(0) + torch.finfo(scale.dtype).tiny
+    solved = solve(factorise(V, firm.expand_as(scale)), slope)
+    S = torch.einsum("pin,pjn->ijn", slope, solved)
+    covariance = torch.stack([S[i, j] for i, j in UPPER])
+    mean = v
+    if problem.neighbours is not None:
+        off = torch.einsum("ijn,jn->in", problem.neighbours.precision(), v - problem.neighbours.vector)
+        moved = v + symmetric_times(covariance, off)
+        # The step is linear; where it leads far it means nothing.
+        usable = moved.isfinite().all(0) & ((moved - v).norm(dim=0) < 0.5)
+        mean = torch.where(usable, moved, v)
+    unsure = ~covariance.isfinite().all(0) | (covariance[[0, 3, 5]] < 0).any(0)
+    blank = torch.tensor([1e4, 0.0, 0.0, 1e4, 0.0, 1e4], dtype=mean.dtype, device=mean.device)
+    return Messages(mean, torch.where(unsure, blank[:, None], covariance))
 
 
-def local_median(
-    values: Float[Tensor, "pixels channels"], mask: Bool[Tensor, "height width"], radius: int
-) -> Float[Tensor, "pixels channels"]:
-    """Median of the neighbours, channel by channel; a pixel without neighbours keeps its own value."""
-
-    def median(pixels: slice, part: Tensor, wanted: Tensor) -> Tensor:
-        own = values[pixels]
-        found = neighbourhood(own, part, radius)[wanted].nanmedian(-1).values
-        return torch.where(found.isfinite(), found, own[wanted])
-
-    # The windows are far larger than the picture.
-    return in_bands(mask, radius, PIXELS_OF_WINDOWS, median)
+def symmetric_times(S: Float[Tensor, "6 *rest"], v: Float[Tensor, "3 *rest"]) -> Float[Tensor, "3 *rest"]:
+    """S v of a symmetric S."""
+    return torch.stack(
+        [
+            S[0] * v[0] + S[1] * v[1] + S[2] * v[2],
+            S[1] * v[0] + S[3] * v[1] + S[4] * v[2],
+            S[2] * v[0] + S[4] * v[1] + S[5] * v[2],
+        ]
+    )
 
 
-def in_bands(
-    mask: Bool[Tensor, "height width"], reach: int, at_once: int, work: Callable[[slice, Tensor, Tensor], Tensor]
-) -> Tensor:
-    """Rows of the picture some at a time, each time with the rows beside them that windows reach into.
+def inverse(S: Float[Tensor, "6 *rest"]) -> Float[Tensor, "6 *rest"]:
+    """Inverse of symmetric positive matrices, by cofactors."""
+    a, b, c, d, e, f = S
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * A + b * B + c * C
+    det = torch.where(det.abs() > 0, det, torch.finfo(S.dtype).tiny)
+    return torch.stack([A, B, C, a * f - c * c, b * c - a * e, a * d - b * b]) / det
 
-    `work` has the band's pixels as a slice of the mask's, its part of the mask, and which of these pixels are wanted;
-    it gives these one row each.
-    """
-    height, width = mask.shape
-    band = max(1, at_once // width)
-    before = [0, *mask.sum(1).cumsum(0).tolist()]
-    result: Tensor | None = None
-    for top in range(0, height, band):
-        end = min(top + band, height)
-        if before[top] == before[end] and (result is not None or end < height):
-            continue
-        first, last = max(0, top - reach), min(height, end + reach)
-        within = torch.zeros_like(mask[first:last])
-        within[top - first : end - first] = True
-        part = work(slice(before[first], before[last]), mask[first:last], within[mask[first:last]])
-        if result is None:
-            result = rows(before[-1], part)
-        result[before[top] : before[end]] = part
-    assert result is not None  # a picture has rows
+
+def upper_root(S: Float[Tensor, "6 *rest"]) -> Float[Tensor, "6 *rest"]:
+    """Upper triangular R with R^T R = S."""
+    least = torch.finfo(S.dtype).tiny
+    r00 = S[0].clamp_min(least).sqrt()
+    r01, r02 = S[1] / r00, S[2] / r00
+    r11 = (S[3] - r01 * r01).clamp_min(1e-12 * S[3].abs() + least).sqrt()
+    r12 = (S[4] - r01 * r02) / r11
+    r22 = (S[5] - r02 * r02 - r12 * r12).clamp_min(1e-12 * S[5].abs() + least).sqrt()
+    return torch.stack([r00, r01, r02, r11, r12, r22])
+
+
+def plus_spread(S: Float[Tensor, "6 *rest"], spread: float) -> Float[Tensor, "6 *rest"]:
+    """S with spread^2 on its diagonal."""
+    result = S.clone()
+    result[[0, 3, 5]] += spread**2
     return result
 
 
-def local_quadratic(
-    values: Float[Tensor, "pixels channels"],
-    weight: Float[Tensor, "pixels"],
-    mask: Bool[Tensor, "height width"],
-    sigma_px: float,
-) -> tuple[Float[Tensor, "pixels channels"], Float[Tensor, "pixels"]]:
-    """Every pixel as its neighbours predict it, and the variance of that if `weight` is 1 / variance.
-
-    A quadratic surface through the others, by least squares under a Gaussian window: a mean would flatten whatever is
-    curved, and a curved surface is what a highlight lies on.
-    """
-    reach = max(1, round(3 * sigma_px))
-
-    def predicted(pixels: slice, part: Tensor, wanted: Tensor) -> Tensor:
-        return _quadratic(values[pixels], weight[pixels], part, sigma_px)[wanted]
-
-    found = in_bands(mask, reach, PIXELS_OF_A_BAND, predicted)
-    return found[:, :-1], found[:, -1]
-
-
-def _quadratic(values: Tensor, weight: Tensor, mask: Tensor, sigma_px: float) -> Float[Tensor, "pixels channels+1"]:
-    """`local_quadratic` of one band: predictions and, last, their variance."""
-    reach = max(1, round(3 * sigma_px))
-    along = torch.arange(-reach, reach + 1, dtype=values.dtype) / sigma_px
-    window = torch.exp(-0.5 * along.square())
-    profiles = torch.stack([along**power * window for power in range(5)])
-    holed = window.clone()
-    holed[reach] = 0.0  # the pixel itself has no say
-
-    def moments(picture: Float[Tensor, "channels height width"], degree: int) -> dict[tuple[int, int], Tensor]:
-        """(channels, pixels) of x^px y^py under the window for every px + py <= degree, the pixel itself left out."""
-        # Of a power of x and one of y: two passes along lines, each with all powers at once.
-        columns = lines(picture, torch.cat([profiles[: degree + 1], holed[None]]), 0)
-        found = {}
-        for py in range(degree + 1):
-            powers = profiles[: degree + 1 - py]
-            if py == 0:
-                powers = torch.cat([holed[None], powers[1:]])
-            for px, moment in enumerate(lines(columns[:, py], powers, 1).unbind(1)):
-                total = moment + columns[:, -1] if px == py == 0 else moment
-                found[px, py] = total[:, mask]
-        return found
-
-    weights, right = to_map(weight[:, None], mask), to_map(values * weight[:, None], mask)
-    of_weights, of_values = moments(weights, 4), moments(right, 2)
-    size = len(QUADRATIC)
-    upper = [(i, j) for i in range(size) for j in range(i, size)]
-
-    def centre(cut: slice) -> Tensor:
-        at = [of_weights[a + c, b + d][0, cut] for (a, b), (c, d) in ((QUADRATIC[i], QUADRATIC[j]) for i, j in upper)]
-        unit = [at[packed_at(size, k, k)].clamp_min(1e-30).rsqrt() for k in range(size)]
-        system = [entry * unit[i] * unit[j] for (i, j), entry in zip(upper, at, strict=True)]
-        # A trace of a ridge: where few neighbours are left the surface is flatter rather than wild.
-        ridge = [torch.full_like(unit[0], 1e-4)] * size
-        # Of the surface only its height here is wanted, a sum of the right hand sides by the inverse's first row.
-        first = [torch.ones_like(unit[0]), *[torch.zeros_like(unit[0])] * (size - 1)]
-        row = [x * u * unit[0] for x, u in zip(solve(factorise(system, ridge), first), unit, strict=True)]
-        height = torch.zeros_like(of_values[0, 0][:, cut])
-        for x, power in zip(row, QUADRATIC, strict=True):
-            height = height + x * of_values[power][:, cut]
-        return torch.cat([height, row[0][None]]).T
-
-    return in_chunks(len(values), centre)
+def pooled(
+    said: Messages, mask: Bool[Tensor, "height width"], width_px: float, spread: float
+) -> tuple[Float[Tensor, "3 pixels"], Float[Tensor, "6 pixels"]]:
+    """Mean of the neighbours of every pixel, and the covariance of the pixel's own v about it."""
+    weight = inverse(plus_spread(said.covariance, spread))
+    planes = torch.cat([weight, symmetric_times(weight, said.mean)])
+    reach = max(1, math.ceil(2.5 * width_px))
+    at = torch.arange(-reach, reach + 1, dtype=planes.dtype)
+    kernel = torch.exp(-0.5 * (at / width_px).square())
+    result = empty(9, planes.shape[1], dtype=planes.dtype)
+    for values, out in zip(planes, result, strict=True):
+        picture = values.new_zeros(mask.shape)
+        picture[mask] = values
+        around = nnf.conv2d(picture[None, None], kernel[None, None, :, None], padding=(reach, 0))
+        around = nnf.conv2d(around, kernel[None, None, None], padding=(0, reach))[0, 0]
+        out[:] = (around - picture)[mask]
+    result[[0, 3, 5]] += FAINT
+    found = inverse(result[:6])
+    return symmetric_times(found, result[6:]), plus_spread(found, spread)
 
 
-def lines(
-    picture: Float[Tensor, "channels height width"], profiles: Float[Tensor, "profiles window"], axis: int
-) -> Float[Tensor, "channels profiles height width"]:
-    """The picture correlated with each profile along its columns (axis 0) or its rows (1); zeros beyond its edge."""
-    reach = profiles.shape[1] // 2
-    shape, padding = ((-1, 1), (reach, 0)) if axis == 0 else ((1, -1), (0, reach))
-    return conv2d(picture[:, None], profiles.view(len(profiles), 1, *shape), padding=padding)
+def likelihood(said: Messages, mean: Tensor, covariance: Tensor) -> float:
+    """Mean log likelihood of what the pictures say of every pixel, foretold from its neighbours."""
+    whole = covariance + said.covariance
+    off = said.mean - mean
+    R = upper_root(whole)
+    log_det = 2.0 * (R[0].log() + R[3].log() + R[5].log())
+    distance = (off * symmetric_times(inverse(whole), off)).sum(0)
+    return float((-0.5 * (distance.clamp_max(OUTLIER) + log_det)).mean())
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """How alike the lobes of neighbours are."""
+
+    width_px: float
+    spread: float
+
+
+def best_smoothness(said: Messages, mask: Bool[Tensor, "height width"]) -> Smoothness:
+    """The width and the spread under which neighbours foretell each other best."""
+    trials = [Smoothness(width, spread) for width in WIDTHS_PX for spread in SPREADS]
+    return max(trials, key=lambda t: likelihood(said, *pooled(said, mask, t.width_px, t.spread)))
+
+
+def neighbours(said: Messages, mask: Bool[Tensor, "height width"], smooth: Smoothness) -> Neighbours:
+    """What is expected of every pixel's lobe by its neighbours."""
+    mean, covariance = pooled(said, mask, smooth.width_px, smooth.spread)
+    return Neighbours(vector=mean, R=upper_root(inverse(covariance)))

@@ -1,342 +1,482 @@
-"""Eqs. 20 to 22 as a least-squares problem of blocks: one block a pixel.
+"""Eqs. 20 to 22 as a least-squares problem of blocks: one block a pixel, pixels last in memory.
 
-    local   l = (d_11, d_12, d_13, d_21, ...; log B [; s_11, ...])       channel-major; 3 C + 1 [+ 3 C] numbers
-    shared  g = (a_1, a_2, a_3, log n_s, log C_2, softness, ggx, log n_d [; delta_41, delta_42, ...])
+    local   l = (d_11, d_12, .., d_1C, d_21, .., d_3C; log B)         basis light by basis light; 3 C + 1 numbers
+    shared  g = (log -a_1, log -a_2, log -a_3, log n_s, f, softness, fresnel, log n_d [; delta_41, delta_42, ..])
 
-ggx is 1 where the lobe is that of GGX microfacets and 0 where it is the paper's power; it is chosen, never solved for.
-The crest of such a lobe is C_2 / 2, its argument in the mirror direction.
+Residuals of a pixel are (model - picture) / sigma for every light and channel, clipped values counting only where the
+model is darker, large ones by Huber's loss; and two rows of what is expected of a pixel before its pictures are seen:
 
-Residuals of a pixel: sqrt(lambda_j) (model - picture) / sigma for every channel and light, then the priors' rows:
+    height      n_s (log |w| - log C_1) / spread          a surface of one gloss has highlights of one height
+    neighbours  R (B m / 2 C_1 - v0)                      the lobe's vector is that of the pixels around, R^T R its
+                                                          precision; see `reflectsep.fit.neighbours`
 
-    shape     (log B + log(|M d|^2 / M d . V) - log C_2) / tau       B d is C_2 (N.V) N.L_k, so B follows from d
-    parallel  (d + s) off the direction of s, relative to |s|         whole and scattered light see one irradiance
-    ratio     (d + s) / s against its neighbourhood                   how much scatters changes slowly over a surface
-    lobe      B d / C_2 against its neighbourhood                     the surface's shape is smooth, whatever its albedo
-    facing    B d / C_2 off the direction of d + s                    scattering blurs the normal, but not by much
-    measured  (s - measured s) / its standard deviation               where s is unknown too
+Everything but the body's own slopes reaches the unknowns through z = B m alone, three numbers a pixel:
+
+    dz = (B / C) sum_c dd_c + B m dlog B
+
+so that with Phi_cj = d body / d d_c, G_j = d F_j / d z and the rows' Hz, gz the normal equations are
+
+    V(d_c, d_e) = [c = e] sum_j Phi Phi^T + (B/C) (K_c + K_e^T) + (B/C)^2 Hz           K_c = sum_j Phi_cj G_j^T
+    V(d_c, log B) = (K_c + (B/C) Hz) z,    V(log B, log B) = z^T Hz z.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd import forward_ad
 
-from reflectsep.fit.mixing import Mixing, mixing
-from reflectsep.kernel.compiling import Speed
-from reflectsep.model import Globals, edge_width, reflectance
+from reflectsep.model import (
+    Globals,
+    length,
+    lobe_by_exponent,
+    lobe_with_slopes,
+    mixed,
+    positive_power,
+    reflectance,
+    transmitted_by_globals,
+    transmitted_with_slope,
+)
+from reflectsep.solve.levenberg import Normal
 
-SHARED_NAMES = ("a_1", "a_2", "a_3", "log_n_s", "log_C_2", "softness", "ggx", "log_n_d")
-LOG_N_S, LOG_C_2, SOFTNESS, GGX, LOG_N_D = 3, 4, 5, 6, 7
+SHARED_NAMES = ("log_a_1", "log_a_2", "log_a_3", "log_n_s", "f", "softness", "fresnel", "log_n_d")
+LOG_N_S, F, SOFTNESS, FRESNEL, LOG_N_D = 3, 4, 5, 6, 7
 ALPHA = len(SHARED_NAMES)
 """Where what is added to the stated alphas begins, if they are refined."""
 
-Moved = TypeVar("Moved", "Observations", "Priors")
-
-LEAST_LOG_N_S = 1.4
-"""log of 4: a broader lobe is no highlight but diffuse light that the diffuse part has not explained."""
-MOST_LOG_N_S = 5.3
-"""log of 200: a sharper lobe is a mirror image, of which a handful of directional lights sees single pixels."""
+COMMON_SD = 0.01
+"""Relative standard deviation of a_k / (L_k . V) among the basis lights: Eq. 7 makes them one number, C_1."""
+LOG_N_S_CENTRE, LOG_N_S_SD = math.log(20.0), 1.5
+"""What is expected of n_s before any picture is seen: it decides only where no picture does."""
+SOFTNESS_SD = 0.5
+FRESNEL_SD = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Observations:
     """What is known of every pixel, flattened, for lights of unit intensity."""
 
-    images: Float[Tensor, "pixels channels lights"]
-    s: Float[Tensor, "pixels channels lights"]
-    weight: Float[Tensor, "pixels channels lights"]
-    """sqrt(lambda_j) / sigma; 0 removes a value."""
-    clipped: Bool[Tensor, "pixels channels lights"]
+    images: Float[Tensor, "lights channels pixels"]
+    s: Float[Tensor, "lights channels pixels"]
+    """Scattering roots."""
+    clipped: Bool[Tensor, "lights channels pixels"]
     """Known only to be at least `images`."""
     alpha: Float[Tensor, "lights 3"]
-    normal_map: Float[Tensor, "3 3"]
-    """M, with M d along the surface normal: the inverse of the basis light directions."""
+    M: Float[Tensor, "3 3"]
+    """Inverse of the basis lights' directions; the identity where they are unknown."""
     view: Float[Tensor, "3"]
     cosine: Float[Tensor, "3"]
     """L_k . V of the basis lights; ones where unknown."""
     lights_known: bool
-    n_d: float | None
+    ggx: bool
+    fixed_n_d: float | None
     """The diffuse exponent; None where it is fitted."""
-    n_d_swept: float = 1.0
+    n_d: float = 1.0
     """The same by the sweeps: where its fit starts."""
     n_d_sd: float = 0.05
-    """Standard deviation of log `n_d_swept`."""
+    """Standard deviation of its logarithm."""
     swept: tuple[bool, ...] = ()
     """Of every light: its s was measured, not mixed; empty: only those of the basis."""
-    s_unknown: bool = False
-    """The scattering roots of the basis lights are local unknowns too."""
-    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
-    """Where chunks of pixels are searched and solved."""
-    fused: Speed | None = None
-    """How the compiled solver runs; None: the plain one."""
+    share: Float[Tensor, "lights 1 1"]
+    """sqrt(lambda_j) of Eq. 22."""
 
     def __len__(self) -> int:
         """Number of pixels."""
-        return len(self.images)
+        return self.images.shape[-1]
 
     @property
     def channels(self) -> int:
         """Number of channels."""
         return self.images.shape[1]
 
-    @property
-    def s_basis(self) -> Float[Tensor, "pixels channels 3"]:
-        """Scattering roots of the basis lights."""
-        return self.s[..., :3]
-
-    def take(self, index: Tensor | slice) -> Observations:
-        """Some of the pixels."""
+    def take(self, index: Tensor | slice) -> Self:
+        """Some of the pixels, in the precision of the arithmetic."""
+        kind = self.alpha.dtype
         return replace(
             self,
-            images=self.images[index],
-            s=self.s[index],
-            weight=self.weight[index],
-            clipped=self.clipped[index],
+            images=self.images[..., index].to(kind),
+            s=self.s[..., index].to(kind),
+            clipped=self.clipped[..., index],
         )
-
-    def there(self) -> Observations:
-        """The same on the device where it is to be worked on."""
-        return moved(self, self.device)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Priors:
-    """What is expected of a pixel before its pictures are looked at; a weight of 0 switches a row off."""
+class Neighbours:
+    """What the pixels around say of a pixel's lobe."""
 
-    shape: float = 1.0 / 0.1
-    """1 / tau of the shape row."""
-    parallel: Float[Tensor, "pixels"]
-    ratio: Float[Tensor, "pixels"]
-    ratio_weight: Float[Tensor, "pixels"]
-    lobe: Float[Tensor, "pixels 3"]
-    """B d / C_2 = (N.V)(N.L_k) as the neighbours have it."""
-    lobe_weight: Float[Tensor, "pixels"]
-    """1 / standard deviation of that."""
-    facing: Float[Tensor, "pixels 3"]
-    """Unit vector along d + s, which is that of N.L_k up to what scattering blurs."""
-    facing_weight: Float[Tensor, "pixels"]
-    """1 / standard deviation of the lobe across that direction."""
-    s_weight: Float[Tensor, "pixels"]
-    """1 / standard deviation of the measured s; only where s is a local unknown."""
-    mirror_sd: float = 0.02
-    """Standard deviation of log(C_2 / -2 C_1): 0 for a lobe about the mirror direction."""
-    common_sd: float = 0.01
-    """Relative standard deviation of a_k / (L_k . V) among the basis lights."""
-    height: float = 1.0
-    """Highest peak of the lobe that is not penalised."""
-    height_sd: float = 0.03
-    """Standard deviation of the logarithm of the excess. Rough surfaces are no cosine lobes, and thousands of pixels
-    that agree on a wrong shape outvote any soft bound on it: the three bounds of the lobe are firm."""
-    exponent_sd: float = 0.001
-    """The same of log n_s beyond `LEAST_LOG_N_S` and `MOST_LOG_N_S`."""
-    log_n_d: float = 0.0
-    n_d_sd: float = 0.05
-    """n_d by the sweeps, and the standard deviation of its logarithm."""
-    softness_sd: float = 0.3
-    alpha_sd: float = 0.02
-    """Standard deviation of a stated alpha, of lights of unit intensity."""
+    vector: Float[Tensor, "3 pixels"]
+    """B m / 2 C_1, which is (N.V)(N.L_k) on an ideal surface."""
+    R: Float[Tensor, "6 pixels"]
+    """Upper triangle, row by row, of a root of its precision: R^T R."""
 
-    def take(self, index: Tensor | slice) -> Priors:
+    def take(self, index: Tensor | slice) -> Neighbours:
         """Some of the pixels."""
-        return replace(
-            self,
-            parallel=self.parallel[index],
-            ratio=self.ratio[index],
-            ratio_weight=self.ratio_weight[index],
-            lobe=self.lobe[index],
-            lobe_weight=self.lobe_weight[index],
-            facing=self.facing[index],
-            facing_weight=self.facing_weight[index],
-            s_weight=self.s_weight[index],
-        )
+        return Neighbours(vector=self.vector[..., index], R=self.R[..., index])
+
+    def rows(self, v: Float[Tensor, "3 pixels"]) -> Float[Tensor, "3 pixels"]:
+        """R (v - v0)."""
+        return upper_times(self.R, v - self.vector)
+
+    def precision(self) -> Float[Tensor, "3 3 pixels"]:
+        """R^T R."""
+        R = self.R.new_zeros(3, 3, self.R.shape[-1])
+        for entry, (i, j) in zip(self.R, UPPER, strict=True):
+            R[i, j] = entry
+        return torch.einsum("kin,kjn->ijn", R, R)
 
 
-def moved(values: Moved, device: torch.device) -> Moved:
-    """Observations or priors with their tensors on a device."""
-    return replace(values, **{k: v.to(device) for k, v in vars(values).items() if isinstance(v, Tensor)})
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-def no_priors(pixels: int, like: Tensor) -> Priors:
-    """Priors whose rows of single pixels are all switched off."""
-    zero = like.new_zeros(pixels)
-    vector = like.new_zeros(pixels, 3)
-    return Priors(
-        shape=0.0,
-        parallel=zero,
-        ratio=zero,
-        ratio_weight=zero,
-        lobe=vector,
-        lobe_weight=zero,
-        facing=vector,
-        facing_weight=zero,
-        s_weight=zero,
+def upper_times(R: Float[Tensor, "6 *rest"], v: Float[Tensor, "3 *rest"]) -> Float[Tensor, "3 *rest"]:
+    """R v of an upper triangular R."""
+    return torch.stack([R[0] * v[0] + R[1] * v[1] + R[2] * v[2], R[3] * v[1] + R[4] * v[2], R[5] * v[2]])
+
+
+def globals_of(shared: Float[Tensor, "G"], obs: Observations) -> Globals:
+    """The shared unknowns by name."""
+    return Globals(
+        a=-shared[:3].exp(),
+        n_s=shared[LOG_N_S].exp(),
+        n_d=shared[LOG_N_D].exp() if obs.fixed_n_d is None else obs.fixed_n_d,
+        f=shared[F],
+        softness=shared[SOFTNESS],
+        fresnel=shared[FRESNEL],
+        ggx=obs.ggx,
+        M=obs.M,
     )
+
+
+def log_size(shared: Float[Tensor, "G"], obs: Observations) -> Tensor:
+    """Log of -C_1 = |w| in the mirror direction: a_k / (L_k . V) of the basis lights, averaged."""
+    size = (shared[:3] - obs.cosine.log()).mean()
+    return size if obs.lights_known else size + math.log(3.0) / 2.0  # |a| itself, M being the identity
 
 
 @dataclass(frozen=True)
-class Locals:
-    """A pixel's unknowns by name."""
+class Refined:
+    """Lights as refined alphas see them."""
 
-    d: Float[Tensor, "pixels channels 3"]
-    log_B: Float[Tensor, "pixels"]  # noqa: N815
-    s: Float[Tensor, "pixels channels 3"] | None
-
-    @property
-    def B(self) -> Float[Tensor, "pixels"]:  # noqa: N802  (the paper's symbol)
-        """The lobe's factor."""
-        return self.log_B.exp()
-
-    def take(self, index: Tensor | slice) -> Locals:
-        """Some of the pixels."""
-        return Locals(self.d[index], self.log_B[index], None if self.s is None else self.s[index])
-
-    def pack(self) -> Float[Tensor, "pixels P"]:
-        """As one row a pixel."""
-        parts = [self.d.flatten(-2), self.log_B[..., None]]
-        return torch.cat(parts if self.s is None else [*parts, self.s.flatten(-2)], -1)
+    obs: Observations
+    intensity: Float[Tensor, "lights"]
 
 
-def unpack(local: Tensor, channels: int) -> Locals:
-    """One row a pixel, by name."""
-    P = 3 * channels
-    d = local[..., :P].unflatten(-1, (channels, 3))
-    s = local[..., P + 1 :].unflatten(-1, (channels, 3)) if local.shape[-1] > P + 1 else None
-    return Locals(d, local[..., P], s)
+def refined(obs: Observations, shared: Float[Tensor, "G"]) -> Refined:
+    """`obs` with refined alphas: I_j = t_j I(beta_j / t_j), beta = alpha + delta, t_j = |sum_i beta_ji L_i|.
 
-
-def mixing_of(obs: Observations, shared: Float[Tensor, "G"]) -> Mixing:
-    """Alphas as `shared` has them."""
-    return mixing(obs.alpha, shared[ALPHA:], torch.linalg.inv(obs.normal_map) if obs.lights_known else None)
-
-
-def alpha_of(obs: Observations, shared: Float[Tensor, "G"]) -> Float[Tensor, "lights 3"]:
-    """Alphas as `shared` has them, the stated ones where they are held."""
-    return obs.alpha if len(shared) == ALPHA else mixing_of(obs, shared).alpha
-
-
-def refined(obs: Observations, shared: Float[Tensor, "G"]) -> Observations:
-    """`obs` as the refined alphas see them: pictures, weights and mixed scattering of lights of unit intensity.
-
-    The same where alphas are held, and then `obs` itself.
+    The length of the mixed vector is the light's intensity, which scales the picture and stays out of the powers. The
+    basis lights' own rows stay the identity: they set the scale of d and s.
     """
     if len(shared) == ALPHA:
-        return obs
-    mixed = mixing_of(obs, shared)
-    own = torch.tensor(obs.swept or [False] * len(obs.alpha), device=obs.images.device)
-    change = obs.s_basis @ (mixed.alpha - obs.alpha).mT
-    return replace(
-        obs,
-        alpha=mixed.alpha,
-        images=obs.images / mixed.intensity,
-        weight=obs.weight * mixed.intensity,
-        s=obs.s + torch.where(own, 0.0, change),
-    )
+        return Refined(obs, torch.ones_like(obs.alpha[:, 0]))
+    beta = torch.cat([obs.alpha[:3], obs.alpha[3:] + shared[ALPHA:].view(-1, 3)])
+    t = torch.ones_like(beta[:, 0])
+    if obs.lights_known:
+        t = torch.cat([t[:3], (beta[3:] @ torch.linalg.inv(obs.M)).norm(dim=-1)])
+    alpha = beta / t[:, None]
+    own = torch.tensor(obs.swept or [False] * len(alpha), device=alpha.device)[:, None, None]
+    change = mixed(alpha - obs.alpha, obs.s[:3])
+    return Refined(replace(obs, alpha=alpha, s=obs.s + torch.where(own, 0.0, change)), t)
 
 
-def unpack_globals(shared: Float[Tensor, "G"], n_d: float | None) -> Globals:
-    """The shared unknowns by name, in the model's own parameters; `n_d` where it is not fitted."""
-    return Globals(
-        a=shared[:3],
-        n_s=shared[LOG_N_S].exp(),
-        n_d=shared[LOG_N_D].exp() if n_d is None else n_d,
-        softness=shared[SOFTNESS],
-        crest=(shared[GGX] > 0).to(shared.dtype) * 0.5 * shared[LOG_C_2].exp(),
-    )
+@dataclass(frozen=True, kw_only=True)
+class PixelProblem:
+    """All pixels under what is observed and expected of them."""
+
+    obs: Observations
+    sigma: float
+    """Standard deviation of a residual."""
+    height_spread: float
+    """Standard deviation of the logarithm of a highlight's height about the one of the whole; inf: none expected."""
+    neighbours: Neighbours | None = None
+    huber: float | None = 5.0
+    """Residuals beyond this many standard deviations are cast shadows or inter-reflections; None: plain squares."""
+    priors: bool = True
+    """Whether anything is expected of the globals beyond what makes them a lobe."""
+    alpha_sd: float = 0.02
+    weight: Float[Tensor, "lights 1 1"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "weight", self.obs.share / self.sigma)
+
+    def __len__(self) -> int:
+        """Number of pixels."""
+        return len(self.obs)
+
+    def take(self, index: Tensor | slice) -> Self:
+        """Some of the pixels."""
+        near = None if self.neighbours is None else self.neighbours.take(index)
+        return replace(self, obs=self.obs.take(index), neighbours=near)
+
+    def unpacked(self, local: Float[Tensor, "P pixels"]) -> tuple[Tensor, Tensor]:
+        """D (3, channels, pixels) and B (pixels)."""
+        return local[:-1].unflatten(0, (3, self.obs.channels)), local[-1].exp()
+
+    def packed(self, d: Float[Tensor, "3 channels pixels"], log_B: Float[Tensor, "pixels"]) -> Tensor:
+        """Local unknowns from d and log B."""
+        return torch.cat([d.flatten(0, 1), log_B[None]])
+
+    def scattering(self, local: Float[Tensor, "P pixels"]) -> Float[Tensor, "3 channels pixels"]:  # noqa: ARG002
+        """Scattering roots of the basis lights: as measured."""
+        return self.obs.s[:3]
+
+    def residuals(self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> Float[Tensor, "rows pixels"]:
+        """Rows of every pixel, pictures first, before the robust loss; differentiable in both arguments."""
+        light = refined(self.obs, shared)
+        obs, g = light.obs, globals_of(shared, self.obs)
+        d, B = self.unpacked(local)
+        model = reflectance(d, B, g, s=obs.s[:3], alpha=obs.alpha, s_lights=obs.s)
+        misfit = model * light.intensity[:, None, None] - obs.images
+        # A clipped value is only a lower bound: a brighter model costs nothing.
+        misfit = torch.where(obs.clipped, misfit.clamp_max(0.0), misfit)
+        rows = [(misfit * self.weight).flatten(0, 1)]
+        z = B * (d + (1.0 - g.f) * obs.s[:3]).mean(1)
+        if math.isfinite(self.height_spread):
+            size = length(g.M, g.a[:, None] + z)
+            rows.append((g.n_s * (size.log() - log_size(shared, obs)) / self.height_spread)[None])
+        if self.neighbours is not None:
+            rows.append(self.neighbours.rows(z / (2.0 * log_size(shared, obs).exp())))
+        return torch.cat(rows)
+
+    def robust(self, rows: Float[Tensor, "rows pixels"]) -> tuple[Tensor, Tensor]:
+        """Cost of every pixel, and the weight of each row in the normal equations."""
+        count = self.obs.images.shape[0] * self.obs.channels
+        size = rows[:count].abs()
+        if self.huber is None:
+            return 0.5 * rows.square().sum(0), torch.ones_like(rows)
+        loss = torch.where(size < self.huber, 0.5 * size.square(), self.huber * (size - 0.5 * self.huber))
+        weight = torch.ones_like(rows)
+        weight[:count] = self.huber / size.clamp_min(self.huber)
+        return loss.sum(0) + 0.5 * rows[count:].square().sum(0), weight
+
+    def _slopes(self, local: Tensor, shared: Tensor) -> _Slopes:
+        light = refined(self.obs, shared)
+        obs, g = light.obs, globals_of(shared, self.obs)
+        d, B = self.unpacked(local)
+        s = obs.s[:3]
+        t = light.intensity[:, None, None]
+        x = mixed(obs.alpha, d) + obs.s
+        b = d + s
+        Mb = mixed(g.M, b)
+        q = (Mb.square().sum(0) + 1e-12).sqrt()
+        c = x / q
+        T, slope = transmitted_with_slope(c, g.softness, g.fresnel)
+        body = q * T
+        by_q = T - c * slope
+        if not (isinstance(g.n_d, float) and g.n_d == 1.0):
+            power = positive_power(body, g.n_d)
+            # Per unit of q T, which is what the globals of the shading change.
+            chain = g.n_d * power / body.clamp_min(1e-30)
+            body, slope, by_q = power, slope * chain, by_q * chain
+        else:
+            chain = torch.ones_like(body)
+        radial = mixed(g.M.mT, Mb) / q
+        m = (d + (1.0 - g.f) * s).mean(1)
+        z = B * m
+        v = g.a[:, None] + z
+        Mv = mixed(g.M, v)
+        size = (Mv.square().sum(0) + 1e-12).sqrt()
+        u = mixed(obs.alpha, v)
+        value, by_u, by_size = lobe_with_slopes(u, size, g.n_s, g.ggx)
+        direction = mixed(g.M.mT, Mv) / size
+        misfit = (body + value[:, None]) * t - obs.images
+        silent = obs.clipped & (misfit > 0)
+        misfit = torch.where(silent, 0.0, misfit)
+        scale = torch.where(silent, 0.0, self.weight * t)
+        rows = [(misfit * self.weight).flatten(0, 1)]
+        # d body / d d_k = slope A_k + by_q radial_k, per light, channel and basis light.
+        Phi = torch.stack([(slope * obs.alpha[:, k, None, None] + by_q * radial[k]) * scale for k in range(3)])
+        G = torch.stack([by_u * obs.alpha[:, k, None] + by_size * direction[k] for k in range(3)])
+        extra: list[Tensor] = []
+        log_C = log_size(shared, obs)
+        if math.isfinite(self.height_spread):
+            gloss = g.n_s / self.height_spread
+            rows.append((gloss * (size.log() - log_C))[None])
+            extra.append(gloss * direction / size)
+        if self.neighbours is not None:
+            per = 0.5 / log_C.exp()
+            rows.append(self.neighbours.rows(z * per))
+            R = self.neighbours.R * per
+            nothing = torch.zeros_like(R[0])
+            extra += [torch.stack(row) for row in ((R[0], R[1], R[2]), (nothing, R[3], R[4]), (nothing, nothing, R[5]))]
+        return _Slopes(
+            torch.cat(rows), Phi, G, scale, extra, z, B / obs.channels, B * s.mean(1), u, size, c, q, body, chain
+        )
+
+    def normal(self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> Normal:
+        """Cost, gradient and Gauss-Newton matrix of every pixel, in closed form."""
+        return self._assembled(self._slopes(local, shared))
+
+    def _assembled(self, at: _Slopes) -> Normal:
+        rows, Phi, scale, z, share = at.rows, at.Phi, at.scale, at.z, at.share
+        lights, channels, _ = self.obs.images.shape
+        cost, weight = self.robust(rows)
+        count = lights * channels
+        w = weight[:count].unflatten(0, (lights, channels))
+        r = w * rows[:count].unflatten(0, (lights, channels))
+        Pw = Phi * w
+        # G belongs to all channels alike, times each value's own scale.
+        ws = w * scale
+        total, pull = (ws * scale).sum(1), (r * scale).sum(1)
+        Hz = torch.empty(3, 3, *z.shape[1:], dtype=z.dtype, device=z.device)
+        gz = torch.empty_like(z)
+        for k in range(3):
+            gz[k] = (at.G[k] * pull).sum(0)
+            for i in range(k + 1):
+                Hz[k, i] = (at.G[k] * at.G[i] * total).sum(0)
+        for row, slope in zip(rows[count:], at.extra, strict=True):
+            gz += row * slope
+            for k in range(3):
+                for i in range(k + 1):
+                    Hz[k, i] += slope[k] * slope[i]
+        for k in range(3):
+            for i in range(k):
+                Hz[i, k] = Hz[k, i]
+        Hzz = (Hz * z[None]).sum(1)
+        K = torch.stack([torch.stack([(Phi[k] * ws * at.G[i][:, None]).sum(0) for i in range(3)]) for k in range(3)])
+        own = {(k, i): (Pw[k] * Phi[i]).sum(0) for k in range(3) for i in range(k + 1)}
+        P = 3 * channels + 1
+        V = torch.zeros(P, P, *z.shape[1:], dtype=z.dtype, device=z.device)
+        blocks = V[:-1, :-1].view(3, channels, 3, channels, -1)
+        for k in range(3):
+            for i in range(k + 1):
+                common = share.square() * Hz[k, i]
+                # (K_c)_ki + (K_e)_ik, c the row's channel and e the column's.
+                blocks[k, :, i] = share * (K[k, i][:, None] + K[i, k][None]) + common
+                blocks[k, :, i].diagonal(dim1=0, dim2=1).add_(own[k, i].mT)
+        V[-1, :-1] = ((K * z[None, :, None]).sum(1) + (share * Hzz)[:, None]).flatten(0, 1)
+        V[-1, -1] = (Hzz * z).sum(0)
+        g = torch.cat([((Phi * r).sum(1) + (share * gz)[:, None]).flatten(0, 1), (gz * z).sum(0)[None]])
+        return Normal(cost, g, V)
+
+    def jacobian(self, local: Float[Tensor, "P pixels"], shared: Tensor) -> Float[Tensor, "rows P pixels"]:
+        """Derivatives of `residuals` by the local unknowns, in closed form."""
+        at = self._slopes(local, shared)
+        lights, channels, pixels = self.obs.images.shape
+        count = lights * channels
+        J = local.new_zeros(len(at.rows), 3 * channels + 1, pixels)
+        pictures = J[:count, :-1].view(lights, channels, 3, channels, pixels)
+        for k in range(3):
+            shine = at.G[k][:, None] * at.scale
+            pictures[:, :, k] = (share_of(at.share, shine))[:, :, None]
+            pictures[:, :, k].diagonal(dim1=1, dim2=2).add_(at.Phi[k].movedim(1, -1))
+        J[:count, -1] = ((at.G * at.z[:, None]).sum(0)[:, None] * at.scale).flatten(0, 1)
+        for i, slope in enumerate(at.extra, count):
+            J[i, :-1] = (at.share * slope)[:, None].expand(3, channels, pixels).flatten(0, 1)
+            J[i, -1] = (slope * at.z).sum(0)
+        return J
+
+    def coupled(self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> tuple[Tensor, ...]:
+        """V, gl, W, H and gg of every pixel."""
+        at = self.normal(local, shared)
+        rows = self.residuals(local, shared)
+        J, Jg = self.jacobian(local, shared), self.shared_jacobian(local, shared)
+        _, weight = self.robust(rows)
+        weighted = Jg * weight[:, None]
+        W = torch.stack([(J * weighted[:, None, i]).sum(0) for i in range(len(shared))], 1)
+        H = torch.stack([(Jg * weighted[:, None, i]).sum(0) for i in range(len(shared))], 1)
+        return at.V, at.g, W, H, (weighted * rows[:, None]).sum(0)
+
+    def shared_jacobian(self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> Tensor:
+        """Derivatives of `residuals` by the shared unknowns (rows, G, pixels): closed forms, autograd for the alphas."""
+        at = self._slopes(local, shared)
+        lights, channels, pixels = self.obs.images.shape
+        count = lights * channels
+        g = globals_of(shared, self.obs)
+        J = local.new_zeros(len(at.rows), len(shared), pixels)
+
+        def through(dv: Float[Tensor, "3 pixels"], column: int) -> None:
+            """What a change of the lobe's vector adds to a column."""
+            J[:count, column] += ((at.G * dv[:, None]).sum(0)[:, None] * at.scale).flatten(0, 1)
+            for row, slope in enumerate(at.extra, count):
+                J[row, column] += (slope * dv).sum(0)
+
+        for k in range(3):
+            # Of a, the pictures and the height see what they see of z; the neighbours' rows see only their unit, C_1.
+            dv = torch.zeros_like(at.z)
+            dv[k] = g.a[k]
+            through(dv, k)
+            if self.neighbours is not None:
+                J[-3:, k] = (
+                    -self.neighbours.rows(at.z * (0.5 / log_size(shared, self.obs).exp())).add(
+                        upper_times(self.neighbours.R, self.neighbours.vector)
+                    )
+                    / 3.0
+                )
+            if math.isfinite(self.height_spread):
+                J[count, k] -= g.n_s / (3.0 * self.height_spread)
+        through(-at.z_by_f, F)
+        if math.isfinite(self.height_spread):
+            J[count, LOG_N_S] = at.rows[count]
+        value = lobe_by_exponent(at.u, at.size, g.n_s, g.ggx)
+        J[:count, LOG_N_S] = (g.n_s * value[:, None] * at.scale).flatten(0, 1)
+        by_softness, by_fresnel = transmitted_by_globals(at.c, g.softness, g.fresnel)
+        for column, slope in ((SOFTNESS, by_softness), (FRESNEL, by_fresnel)):
+            J[:count, column] = (at.q * slope * at.chain * at.scale).flatten(0, 1)
+        if self.obs.fixed_n_d is None:
+            body = at.body
+            J[:count, LOG_N_D] = (body * body.clamp_min(1e-30).log() * at.scale).flatten(0, 1)
+        for column in range(ALPHA, len(shared)):
+            axis = torch.zeros_like(shared)
+            axis[column] = 1.0
+            with forward_ad.dual_level():
+                found = forward_ad.unpack_dual(self.residuals(local, forward_ad.make_dual(shared, axis)))
+                J[:, column] = found.tangent
+        return J
+
+    def shared_rows(self, shared: Float[Tensor, "G"]) -> Float[Tensor, "rows"]:
+        """What is expected of the globals, as residuals that are linear in them."""
+        common = (shared[:3] - self.obs.cosine.log()) / COMMON_SD
+        rows = [common - common.mean()] if self.obs.lights_known else [0.0 * common]
+        rows.append(((shared[LOG_N_D] - math.log(self.obs.n_d)) / self.obs.n_d_sd)[None])
+        if self.priors:
+            expected = (
+                (shared[LOG_N_S] - LOG_N_S_CENTRE) / LOG_N_S_SD,
+                shared[SOFTNESS] / SOFTNESS_SD,
+                (shared[FRESNEL] - 0.5) / FRESNEL_SD,
+            )
+            rows.append(torch.stack(expected))
+        return torch.cat([*rows, shared[ALPHA:] / self.alpha_sd])
+
+    def bounded(self, shared: Float[Tensor, "G"]) -> Float[Tensor, "G"]:
+        """F and fresnel are shares; an exponent below 0.3 or above 5000 is no lobe."""
+        result = shared.clone()
+        result[[F, FRESNEL]] = result[[F, FRESNEL]].clamp(0.0, 1.0)
+        result[LOG_N_S] = result[LOG_N_S].clamp(math.log(0.3), math.log(5000.0))
+        return result
 
 
-def linear(x: Float[Tensor, "*pixels 3"], M: Float[Tensor, "n 3"]) -> Float[Tensor, "*pixels n"]:
-    """M x of every pixel, by the same additions however many pixels there are, which a matrix product is not."""
-    return x[..., :1] * M[:, 0] + x[..., 1:2] * M[:, 1] + x[..., 2:] * M[:, 2]
+@dataclass(frozen=True)
+class _Slopes:
+    """A pixel's rows and what their derivatives are made of."""
+
+    rows: Tensor
+    Phi: Float[Tensor, "3 lights channels pixels"]
+    G: Float[Tensor, "3 lights pixels"]
+    scale: Float[Tensor, "lights channels pixels"]
+    extra: list[Tensor]
+    """Slopes by z of the rows after the pictures'."""
+    z: Float[Tensor, "3 pixels"]
+    share: Float[Tensor, "pixels"]
+    """B / C."""
+    z_by_f: Float[Tensor, "3 pixels"]
+    """What z loses as f grows: B mean_c s."""
+    u: Float[Tensor, "lights pixels"]
+    size: Float[Tensor, "pixels"]
+    """|w|."""
+    c: Tensor
+    """Cosine of the body."""
+    q: Float[Tensor, "channels pixels"]
+    body: Float[Tensor, "lights channels pixels"]
+    chain: Tensor
+    """Derivative of the body by q T."""
 
 
-def log_shape(d: Float[Tensor, "*pixels 3"], M: Tensor, view: Tensor, known: bool) -> Float[Tensor, "*pixels"]:
-    """Log of |M d|^2 / (M d . V), or of mean_k d where the lights are unknown: C_2 / B by the lobe's geometry.
-
-    d_k = q N.L_k gives M d = q N; and B d_k = C_2 (N.V)(N.L_k) (Eqs. 6, 7 and 18), hence B = C_2 (N.V) / q.
-    """
-    if not known:
-        mean = d.mean(-1)
-        return (0.5 * (mean + (mean.square() + 1e-8).sqrt())).log()
-    g = linear(d, M)
-    facing = linear(g, view[None])[..., 0]
-    # Smooth stand-ins for max(., 0): a normal turned away must not make the row infinite.
-    facing = 0.5 * (facing + (facing.square() + 1e-6).sqrt())
-    return (g.square().sum(-1) + 1e-6).log() - facing.log()
-
-
-def shape_row(log_B: Tensor, d_mean: Float[Tensor, "*pixels 3"], shared: Tensor, obs: Observations) -> Tensor:
-    """Log B less its value by the lobe's geometry; 0 on a surface of one gloss."""
-    return log_B + log_shape(d_mean, obs.normal_map, obs.view, obs.lights_known) - shared[LOG_C_2]
-
-
-def normalised_lobe(x: Locals, shared: Tensor) -> Float[Tensor, "pixels 3"]:
-    """B mean_c d / C_2, which is (N.V)(N.L_k): a matter of shape alone."""
-    return x.B[:, None] * x.d.mean(-2) / shared[LOG_C_2].exp()
-
-
-def across(v: Float[Tensor, "pixels 3"], direction: Float[Tensor, "pixels 3"]) -> Float[Tensor, "pixels 3"]:
-    """The part of v that is not along the unit vector `direction`."""
-    return v - (v * direction).sum(-1, keepdim=True) * direction
-
-
-def s_of_lights(x: Locals, obs: Observations) -> Float[Tensor, "pixels channels lights"]:
-    """Scattering roots of every light: as measured, moved by the mix of what the fit changed of the basis."""
-    return obs.s if x.s is None else obs.s + (x.s - obs.s_basis) @ obs.alpha.mT
-
-
-def pixel_residual(
-    local: Tensor, shared: Tensor, obs: Observations, priors: Priors
-) -> Float[Tensor, "pixels residuals"]:
-    """Residuals of every pixel, pictures first, then the priors' rows."""
-    obs = refined(obs, shared)
-    x = unpack(local, obs.channels)
-    s = obs.s_basis if x.s is None else x.s
-    model = reflectance(
-        x.d,
-        x.B,
-        unpack_globals(shared, obs.n_d),
-        s=s_of_lights(x, obs),
-        alpha=obs.alpha,
-        width=edge_width(obs.s_basis, shared[SOFTNESS]),
-    )
-    misfit = model - obs.images
-    # A clipped value is only a lower bound: a brighter model costs nothing.
-    misfit = torch.where(obs.clipped, misfit.clamp_max(0.0), misfit)
-    rows = [(misfit * obs.weight).flatten(-2)]
-
-    rows.append((priors.shape * shape_row(x.log_B, x.d.mean(-2), shared, obs))[..., None])
-
-    whole, power = x.d + s, s.square().sum(-1, keepdim=True) + 1e-9
-    along = (whole * s).sum(-1, keepdim=True) / power
-    rows.append((priors.parallel[..., None, None] * (whole - along * s)).flatten(-2))
-    rows.append(priors.ratio_weight[..., None] * (along[..., 0].mean(-1, keepdim=True) - priors.ratio[..., None]))
-    lobe = normalised_lobe(x, shared)
-    rows.append(priors.lobe_weight[..., None] * (lobe - priors.lobe))
-    rows.append(priors.facing_weight[..., None] * across(lobe, priors.facing))
-    if x.s is not None:
-        rows.append((priors.s_weight[..., None, None] * (x.s - obs.s_basis)).flatten(-2))
-    return torch.cat(rows, -1)
-
-
-def shared_residual(shared: Tensor, cosine: Tensor, priors: Priors) -> Float[Tensor, "rows"]:
-    """Priors of the shared parameters (method: a physical lobe is bounded and about the mirror direction)."""
-    C_1 = shared[:3] / cosine
-    mean = C_1.mean()
-    log_C_1 = (-mean).clamp_min(1e-3).log()
-    excess = shared[LOG_N_S].exp() * log_C_1 - math.log(priors.height)
-    rows = torch.stack(
-        [
-            (shared[LOG_C_2] - log_C_1 - math.log(2.0)) / priors.mirror_sd,
-            excess.clamp_min(0.0) / priors.height_sd,
-            (shared[LOG_N_S] - MOST_LOG_N_S).clamp_min(0.0) / priors.exponent_sd,
-            (LEAST_LOG_N_S - shared[LOG_N_S]).clamp_min(0.0) / priors.exponent_sd,
-            (shared[LOG_N_D] - priors.log_n_d) / priors.n_d_sd,
-            shared[SOFTNESS] / priors.softness_sd,
-        ]
-    )
-    return torch.cat([(C_1 / mean - 1.0) / priors.common_sd, rows, shared[ALPHA:] / priors.alpha_sd])
+def share_of(share: Float[Tensor, "pixels"], shine: Float[Tensor, "lights channels pixels"]) -> Tensor:
+    """What a channel's d adds to a value through the lobe, which sees the mean of all channels."""
+    return share * shine

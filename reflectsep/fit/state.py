@@ -1,32 +1,41 @@
-"""The value that the steps of a fit hand on."""
+"""Where a fit is: the problem as it stands, and what has been found of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from reflectsep.fit.problem import Observations, Priors
-from reflectsep.fit.solution import Effort, LocalFit
+from reflectsep.fit.neighbours import Smoothness
+from reflectsep.fit.problem import PixelProblem
+from reflectsep.fit.sample import Sample
 from reflectsep.solve.joint import JointSolution
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The sample that the globals were fitted to, and its pixels' unknowns."""
+
+    chosen: Sample
+    problem: PixelProblem
+    local: Float[Tensor, "P pixels"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """A fit under way."""
+    """The fit between two of its stages."""
 
-    obs: Observations
-    priors: Priors
+    problem: PixelProblem
     mask: Bool[Tensor, "height width"]
-    effort: Effort
-    robust: float | None
-    sigma: float
+    """The pixels that are fitted."""
     shared: Float[Tensor, "G"]
     free: Bool[Tensor, "G"]
-    body: Float[Tensor, "pixels channels 3"]
-    """Robust whole diffuse root, from before any lobe was fitted."""
-    found: LocalFit
+    smooth: Smoothness | None
+    local: Float[Tensor, "P pixels"]
+    peak: float
+    """The brightest values of the pictures."""
+    cost: Float[Tensor, "pixels"] | None = None
+    status: Int[Tensor, "pixels"] | None = None
     joint: JointSolution | None = None
-    scales: tuple[tuple[float, float], ...] = ()
-    """Neighbourhoods that had a say in the lobes: width and spread."""
+    sampled: Sampled | None = None

@@ -14,7 +14,7 @@ from reflectsep.io.exr import read_channels, write_channels
 from reflectsep.io.files import atomic_folder, inside, read_json, sha256, write_json
 from reflectsep.io.pictures import write_picture
 
-FORMAT = "reflectsep-result/1"
+FORMAT = "reflectsep-result/2"
 DOCUMENT = "separation.json"
 
 

@@ -75,6 +75,9 @@ def global_parameters(separation: Separation, stack: PhotometricStack | None) ->
     sd = {name: math.sqrt(max(0.0, float(values[i, i]))) for i, name in enumerate(order)}
     n_s = float(separation.n_s)
     sds = {**sd, "n_s": n_s * sd["log_n_s"]} if "log_n_s" in sd else sd
+    sds |= {
+        f"a_{k + 1}": abs(float(separation.a[k])) * sd[f"log_a_{k + 1}"] for k in range(3) if f"log_a_{k + 1}" in sd
+    }
     found = [
         (f"a_{k + 1}", float(separation.a[k]), f"offset of the lobe under basis light {separation.basis[k]}")
         for k in range(3)
@@ -82,12 +85,9 @@ def global_parameters(separation: Separation, stack: PhotometricStack | None) ->
     found += [
         ("n_s", n_s, "exponent of the lobe: the larger, the glossier"),
         ("n_d", float(separation.n_d), "exponent of the diffuse part"),
-        ("softness", float(separation.softness), "width of the shadow's edge, of the mean scattering root; 0: hard"),
-        (
-            "crest",
-            float(separation.crest),
-            "of a GGX lobe: its argument in the mirror direction; 0: a power",
-        ),
+        ("f", float(separation.f), "share of scattered light that has forgotten the normal; 1: the paper"),
+        ("softness", float(separation.softness), "of a shadow's edge, in units of the cosine; 0: hard"),
+        ("fresnel", float(separation.fresnel), "share of Fresnel's losses that the body obeys; 0: the paper"),
     ]
     n_d_sd, source = separation.document.get("n_d_sd"), separation.document.get("n_d_source")
     held = {"n_d": f"± {n_d_sd:.2g}, by the sweeps" if n_d_sd and source == "estimated" else f"{source}"}

@@ -26,7 +26,7 @@ def maps(separation: Separation) -> Section:
     signed = [inside(separation.residual[i].mean(0)) for i in range(len(separation.names))]
     root = (separation.d + separation.s).abs().mean((0, 1)).clamp_min(1e-9)
     d_sd = inside(100 * separation.d_sd.square().mean((0, 1)).sqrt() / root)
-    B_sd = inside(100 * (separation.B_sd / separation.B.clamp_min(1e-9)).mean(0))
+    B_sd = inside(100 * (separation.B_sd / separation.B.clamp_min(1e-9)))
     rows = [
         [
             Panel(title="misfit of all lights", picture=residual, unit=f"rms, {UNIT}", limits=upper_limit(residual)),
@@ -34,7 +34,7 @@ def maps(separation: Separation) -> Section:
             Panel(title="uncertainty of B", picture=B_sd, unit="sd, % of B", logarithmic=True),
             Panel(
                 title="B, strength of the lobe",
-                picture=inside(separation.B.mean(0)),
+                picture=inside(separation.B),
                 unit="1 / root of the capture's unit",
             ),
         ]

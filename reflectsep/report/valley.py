@@ -6,7 +6,7 @@ rise of the cost, the less the split between highlight and diffuse part is deter
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from reflectsep.data import PhotometricStack
 from reflectsep.flags import Flag
-from reflectsep.model import diffuse, edge_width, lobe
+from reflectsep.model import Globals, diffuse, length, lobe_of, mixed
 from reflectsep.separation import Separation
 
 PIXELS = 120
@@ -52,7 +52,7 @@ def cost_valley(separation: Separation, stack: PhotometricStack, *, count: int =
     I = stack.images.mean(1)[:, row, column].T.double() / intensity.double().clamp_min(1e-12)  # noqa: E741
     scales = torch.linspace(1 - SPAN, 1 + SPAN, count, dtype=torch.float64)
     a = scales[:, None, None, None] * separation.a.double()
-    B = separation.B.mean(0)[row, column].double()
+    B = separation.B[row, column].double()
     case = _Case(separation=separation, alpha=alpha.double(), d=d, s=s, I=I)
     x = d.expand(count, count, -1, -1).clone()  # jvp writes into what it is given
     _, held = case.refitted(x, a, scales[None, :, None] * B)
@@ -65,6 +65,11 @@ def cost_valley(separation: Separation, stack: PhotometricStack, *, count: int =
         x = torch.where((misfit < free)[..., None], other, x)
         free = torch.minimum(free, misfit)
     return Valley(scales=scales, misfit=held.mean(-1).sqrt(), along=free.mean(-1).sqrt()[:, 0], pixels=len(where))
+
+
+def in_double(g: Globals) -> Globals:
+    """The globals in double precision."""
+    return replace(g, **{name: value.double() for name, value in vars(g).items() if isinstance(value, Tensor)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,10 +85,12 @@ class _Case:
     def residual(self, x: Float[Tensor, "*grid pixels unknowns"], a: Tensor, B: Tensor) -> Tensor:
         """Model minus picture; x is d, or d and B over its start `B`."""
         d, B = x[..., :3], B * x[..., 3] if x.shape[-1] == 4 else B
-        width = edge_width(self.s[:, None], self.separation.softness.double())[..., 0]
-        body = diffuse((d + self.s) @ self.alpha.mT, width, self.separation.globals.n_d)
-        u = (a + B[..., None] * d) @ self.alpha.mT
-        return body + lobe(u, self.separation.n_s.double(), self.separation.crest.double()) - self.I
+        g = in_double(self.separation.globals)
+        first = lambda x: x.movedim(-1, 0)  # noqa: E731
+        whole = first(d + self.s)
+        body = diffuse(mixed(self.alpha, whole), length(g.M, whole), g)
+        v = first(a + B[..., None] * (d + (1.0 - g.f) * self.s))
+        return (body + lobe_of(v, g, self.alpha)).movedim(0, -1) - self.I
 
     def refitted(self, x: Float[Tensor, "*grid pixels unknowns"], a: Tensor, B: Tensor) -> tuple[Tensor, Tensor]:
         """`x` after Gauss-Newton from there, and the mean square misfit of every pixel and place of the grid."""

@@ -79,7 +79,7 @@ def lead(facts: Facts) -> str:
     if scattered:
         row.append(Panel(title="local diffuse", picture=separation.local_diffuse[0], white=white))
         row.append(Panel(title="scattering", picture=separation.scattering[0], white=white))
-    kept = extensions(float(separation.softness), float(separation.crest))
+    kept = extensions(separation)
     rms = float(document.get("residual", {}).get("rms", float("nan")))
     peak = float(whole[:, :, separation.mask].max())
     height, width = separation.mask.shape

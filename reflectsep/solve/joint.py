@@ -1,236 +1,138 @@
-"""Gauss-Newton on blocks and shared parameters together, by the Schur complement.
+"""Levenberg-Marquardt on all blocks and what they share, by the Schur complement.
 
-    [ V    W ] [dl]     [gl]
-    [ W^T  H ] [dg] = - [gg],       V block diagonal (one block a pixel), W (P, G) a block, H (G, G)
+    [ V  W ; W^T H ] [dl ; dg] = -[gl ; gg]          V block diagonal, one block a pixel
+    S dg = -(gg - W^T V^-1 gl),   S = H - W^T V^-1 W,   dl = -V^-1 (gl + W dg)
 
-    S dg = -(gg - W^T V^-1 gl),     S = H - W^T V^-1 W,     dl = -V^-1 (gl + W dg)
-
-Only S and the reduced gradient are summed over blocks, a handful of numbers a chunk, so memory is bounded by the
-chunk and chunks may live anywhere. One damping for everything is a poor solver: blocks are damped each on its own by
-a few local iterations after every shared step (variable projection), the shared parameters by theirs.
+Every trial of the shared parameters is followed by a few iterations of the blocks on their own (variable projection,
+Golub & Pereyra 1973), each with its own damping: one damping for everything is a poor solver.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Protocol, Self
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.solve.local import LocalSolution, Termination, scale_of, solve_local, solve_positive
-from reflectsep.solve.problem import BlockProblem
-from reflectsep.solve.sharing import by_chunks, workers
+from reflectsep.solve.levenberg import Problem, Solution, Status, Termination, solve_in_chunks
+from reflectsep.solve.linear import factorise, solve
+from reflectsep.solve.sharing import by_chunks
 
-MOST_DAMPING = 1e8
-"""Where no step is short enough to lower the cost, there is none."""
-
-
-COMPANY = 16
-"""The last blocks of so many chunks are few, and few take as long as many."""
+TRIALS = 5
+"""Dampings of the shared parameters that are tried in one iteration."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointOptions:
-    """How the shared parameters are stepped and when they are done."""
+class JointProblem(Problem, Protocol):
+    """A problem that can tell how its blocks hang on what they share."""
 
-    max_iterations: int = 40
-    tolerance: float = 1e-7
-    """Stop where the undamped shared step promises a relative decrease of the whole cost below this."""
-    inner: Termination = field(default_factory=Termination)
-    """Local iterations after every shared step. To the end: on blocks that are on their way the shared steps creep
-    (20 steps and 20 s where 6 steps and 6 s do), and few blocks need more than two or three."""
-    chunk: int = 1 << 12
-    damping: float = 1e-4
+    def take(self, index: Tensor | slice) -> Self:
+        """Some of the blocks."""
+        ...
+
+    def coupled(
+        self, local: Float[Tensor, "P blocks"], shared: Float[Tensor, "G"]
+    ) -> tuple[Float[Tensor, "P P blocks"], Float[Tensor, "P blocks"], Tensor, Tensor, Tensor]:
+        """V, gl, W (P, G, blocks), and of every block its part of H (G, G, blocks) and gg (G, blocks)."""
+        ...
+
+    def shared_rows(self, shared: Float[Tensor, "G"]) -> Float[Tensor, "rows"]:
+        """What is expected of the shared parameters themselves, as residuals."""
+        ...
+
+    def bounded(self, shared: Float[Tensor, "G"]) -> Float[Tensor, "G"]:
+        """The nearest shared parameters that mean something."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointSolution:
-    """Where blocks and shared parameters ended."""
+    """Where a joint solve ended."""
 
-    local: Float[Tensor, "blocks P"]
+    local: Float[Tensor, "P blocks"]
     shared: Float[Tensor, "G"]
-    cost: float
-    information: Float[Tensor, "G G"]
-    """S: inverse covariance of the shared parameters, the blocks marginalised."""
+    cost: Float[Tensor, "blocks"]
     iterations: int
-    converged: bool
-    settled: Bool[Tensor, "blocks"]
-    """Of every block: its own iterations have come to their end at the final shared parameters."""
+    status: Status
     history: tuple[float, ...]
 
 
-@dataclass(frozen=True)
-class ReducedSystem:
-    """The shared parameters' own normal equations after the blocks are eliminated; systems of chunks add."""
-
-    S: Tensor
-    gradient: Tensor
-
-
-def reduced_system(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: int) -> ReducedSystem:
-    """S and the reduced gradient at (local, shared), chunk by chunk."""
-
-    def reduced(cut: slice) -> tuple[Tensor, Tensor]:
-        part, here, there = problem.chunk(cut, local[cut], shared)
-        at = part.coupled_equations(here, there)
-        solved = solve_firm(at.V, torch.cat([at.W.transpose(0, 1), at.gradient[None]]))
-        taken = torch.einsum("pgn,hpn->gh", at.W, solved)
-        S, gradient = at.H - taken[:, :-1], at.shared_gradient - taken[:, -1]
-        return S[None].to(local.device), gradient[None].to(local.device)
-
-    S, gradient = (parts.sum(0) for parts in by_chunks(len(local), chunk, reduced))
-    if problem.shared_residual is not None:
-        q = problem.shared_residual(shared)
-        # In single precision, zeros come back from torch in double.
-        Q = torch.func.jacrev(problem.shared_residual)(shared).to(q.dtype)
-        S, gradient = S + Q.mT @ Q, gradient + Q.mT @ q
-    return ReducedSystem(S, gradient)
-
-
-def shared_step(system: ReducedSystem, mu: float, free: Tensor | None) -> Tensor:
-    """-(S + mu diag S)^-1 gradient over the free parameters, 0 for the others."""
-    G = len(system.gradient)
-    index = torch.arange(G) if free is None else free.nonzero()[:, 0]
-    S, gradient = system.S[index][:, index], system.gradient[index]
-    # In units of each parameter's own curvature; rounding must not make the system singular in single precision.
-    unit = S.diagonal().clamp_min(1e-30).rsqrt()
-    least = 10.0 * G * torch.finfo(S.dtype).eps
-    scaled = S * unit[:, None] * unit + max(mu, least) * torch.eye(len(index), dtype=S.dtype, device=S.device)
-    step = torch.zeros_like(system.gradient)
-    step[index] = -unit * torch.linalg.solve(scaled, unit * gradient)
-    return step
-
-
-def promised(system: ReducedSystem, free: Tensor | None) -> float:
-    """By how much the undamped shared step would lower the cost, were it quadratic: 1/2 gradient S^-1 gradient."""
-    step = shared_step(system, 0.0, free)
-    return float(-(system.gradient @ step) - 0.5 * step @ system.S @ step)
-
-
-def solve_firm(V: Float[Tensor, "P P blocks"], right: Float[Tensor, "sides P blocks"]) -> Tensor:
-    """V^-1 right of every block; directions that no residual feels get no say instead of an infinite one."""
-    scale = scale_of(V)
-    least = max(1e-9, 20.0 * torch.finfo(V.dtype).eps)
-    return solve_positive(V, torch.maximum(V.diagonal().T, scale) + least * scale, right)
-
-
-def inverse(V: Float[Tensor, "blocks P P"]) -> Float[Tensor, "blocks P P"]:
-    """V^-1 of every block; directions that no residual feels get no say instead of an infinite one."""
-    diagonal = V.diagonal(dim1=-2, dim2=-1)
-    unit = diagonal.clamp_min(1e-12 * diagonal.amax(-1, keepdim=True)).clamp_min(1e-30).rsqrt()
-    system = V * unit[..., :, None] * unit[..., None, :]
-    least = max(1e-9, 20.0 * torch.finfo(V.dtype).eps)
-    system = system + least * torch.eye(V.shape[-1], dtype=V.dtype, device=V.device)
-    factor, info = torch.linalg.cholesky_ex(system)
-    result = torch.cholesky_inverse(factor) * unit[..., :, None] * unit[..., None, :]
-    sound = (info == 0)[..., None, None] & result.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
-    return torch.where(sound, result, torch.zeros_like(result))
-
-
-def follow(problem: BlockProblem, local: Tensor, shared: Tensor, step: Tensor, chunk: int) -> Tensor:
-    """Blocks moved along with the shared step, dl = -V^-1 (gl + W dg), each only where that lowers its cost.
-
-    Along a flat valley (here: a against B) blocks that wait for their own iterations would make every shared step
-    look bad.
-    """
-
-    def moved(cut: slice) -> tuple[Tensor]:
-        part, here, before, by = problem.chunk(cut, local[cut], shared, step)
-        at = part.coupled_equations(here, before)
-        pull = at.gradient + torch.einsum("pgn,g->pn", at.W, by)
-        there = here - solve_firm(at.V, pull[None])[0].T
-        better = part.costs(there, before + by) < part.costs(here, before + by)
-        return (torch.where(better[:, None], there, here).to(local.device),)
-
-    return by_chunks(len(local), chunk, moved)[0]
-
-
-def costs_in_chunks(problem: BlockProblem, local: Tensor, shared: Tensor, chunk: int) -> Float[Tensor, "blocks"]:
-    """Cost of every block, chunk by chunk."""
-
-    def costs(cut: slice) -> tuple[Tensor]:
-        part, here, there = problem.chunk(cut, local[cut], shared)
-        return (part.costs(here, there).to(local.device),)
-
-    return by_chunks(len(local), chunk, costs)[0]
-
-
-def local_in_chunks(
-    problem: BlockProblem,
-    local: Tensor,
-    shared: Tensor,
-    termination: Termination,
-    chunk: int,
-    which: Tensor | None = None,
-) -> LocalSolution:
-    """`solve_local` with `chunk` blocks under way of `COMPANY` times as many, and so on to the last.
-
-    Of the blocks `which` alone, whose places `local` are, where it is given.
-    """
-
-    def solved(cut: slice) -> tuple[Tensor, ...]:
-        blocks, here, there = problem.chunk(cut if which is None else which[cut], local[cut], shared)
-        part = solve_local(blocks, here, there, termination, at_once=chunk)
-        found = (each.to(local.device) for each in (part.local, part.cost, part.converged))
-        return *found, torch.tensor([part.iterations])
-
-    # Where a block ends depends on no other, so that these cuts may go by who is there to work on them.
-    crew = workers().count
-    share = -(-len(local) // (2 * crew)) if crew > 1 else len(local)
-    places, cost, converged, iterations = by_chunks(len(local), max(chunk, min(COMPANY * chunk, share)), solved)
-    return LocalSolution(local=places, cost=cost, converged=converged, iterations=int(iterations.max()))
-
-
 def solve_joint(
-    problem: BlockProblem,
-    local: Float[Tensor, "blocks P"],
+    problem: JointProblem,
+    local: Float[Tensor, "P blocks"],
     shared: Float[Tensor, "G"],
-    options: JointOptions = JointOptions(),
+    free: Bool[Tensor, "G"],
     *,
-    free: Bool[Tensor, "G"] | None = None,
-    watch: Callable[[int, float], None] | None = None,
+    end: Termination,
+    inner: Termination,
+    chunk: int,
+    trim: float = 1.0,
+    watch: Callable[[int], None] = lambda _: None,
 ) -> JointSolution:
-    """Minimise the whole cost over blocks and shared parameters from (local, shared).
+    """Minimum over all blocks and the `free` shared parameters.
 
-    Shared parameters where `free` is false stay as they are; `watch(iteration, cost)` is called after every step.
+    `trim` is the share of the blocks, those of least cost, that has a say in the shared parameters.
     """
-    # Not the blocks first: under shared parameters that are off, their ends are further off, and in wrong minima.
-    cost = float(costs_in_chunks(problem, local, shared, options.chunk).sum() + problem.shared_cost(shared))
-    history, mu, converged, iteration = [cost], options.damping, False, 0
-    settled = torch.zeros(len(local), dtype=torch.bool, device=local.device)
-    system = reduced_system(problem, local, shared, options.chunk)
-    while not converged and iteration < options.max_iterations:
-        iteration += 1
-        better: tuple[Tensor, Tensor, float] | None = None
-        while better is None and mu < MOST_DAMPING:
-            step = shared_step(system, mu, free)
-            moved = follow(problem, local, shared, step, options.chunk)
-            trial = local_in_chunks(problem, moved, shared + step, options.inner, options.chunk)
-            settled = trial.converged
-            trial_cost = float(trial.cost.sum() + problem.shared_cost(shared + step))
-            if trial_cost < cost:
-                better = trial.local, shared + step, trial_cost
-            else:
-                mu *= 8.0
-        if better is None:
-            converged = True
+    if len(problem) == 0:
+        raise ValueError("a joint solve of no blocks")
+
+    def settled(at: Tensor, start: Tensor, shared: Tensor, limit: Termination) -> Solution:
+        return solve_in_chunks(len(problem), chunk, shared, limit, lambda cut: (problem.take(cut), at[:, cut]))
+
+    now = settled(local, local, shared, inner)
+    damping, status = 1e-3, Status.EXHAUSTED
+    history: list[float] = []
+    index = free.nonzero()[:, 0]
+    iteration = 0
+    for iteration in range(1, end.max_iterations + 1):
+        voters = now.cost.argsort()[: max(1, int(trim * len(problem)))].sort().values
+        total = lambda s, g, v=voters: float(s.cost[v].sum() + 0.5 * problem.shared_rows(g).square().sum())  # noqa: E731
+        before = total(now, shared)
+        history.append(before)
+        S, right = reduced(problem, now.local, shared, chunk, voters)
+        S, right = S[index][:, index], right[index]
+        moved = None
+        for _ in range(TRIALS if len(index) else 0):
+            system = S + torch.diag(damping * S.diagonal().clamp_min(1e-12) + 1e-9 * S.diagonal().amax())
+            step = torch.linalg.lstsq(system, right[:, None]).solution[:, 0].clamp(-0.5, 0.5)
+            trial = shared.clone()
+            trial[index] += step
+            trial = problem.bounded(trial)
+            found = settled(now.local, now.local, trial, inner)
+            if total(found, trial) < before:
+                moved = found, trial
+                break
+            damping = max(10.0 * damping, 1e-2)
+        watch(iteration)
+        if moved is None:
+            status = Status.CONVERGED
             break
-        local, shared, cost = better
-        mu = max(mu * 0.2, 1e-9)
-        history.append(cost)
-        if watch is not None:
-            watch(iteration, cost)
-        system = reduced_system(problem, local, shared, options.chunk)
-        converged = promised(system, free) <= options.tolerance * cost
+        change = float((moved[1] - shared).abs().max())
+        fall = before - total(*moved)
+        now, shared, damping = *moved, 0.1 * damping
+        if fall <= end.tolerance * before or change < 1e-4:
+            status = Status.CONVERGED
+            break
     return JointSolution(
-        local=local,
-        shared=shared,
-        cost=cost,
-        information=system.S,
-        iterations=iteration,
-        converged=converged,
-        settled=settled,
-        history=tuple(history),
+        local=now.local, shared=shared, cost=now.cost, iterations=iteration, status=status, history=tuple(history)
     )
+
+
+def reduced(
+    problem: JointProblem, local: Tensor, shared: Tensor, chunk: int, voters: Tensor
+) -> tuple[Float[Tensor, "G G"], Float[Tensor, "G"]]:
+    """S and -(gg - W^T V^-1 gl) over the blocks `voters`, the shared parameters' own prior included."""
+
+    def part(cut: slice) -> tuple[Tensor, Tensor]:
+        which = voters[cut]
+        V, gl, W, H, gg = problem.take(which).coupled(local[:, which], shared)
+        factor = factorise(V, 1e-12 * V.diagonal(dim1=0, dim2=1).mT.amax(0) * torch.ones_like(gl))
+        X = solve(factor, torch.cat([W, gl[:, None]], 1))
+        S = H.sum(-1) - torch.einsum("pgn,phn->gh", W, X[:, :-1])
+        return S[None], (-(gg.sum(-1) - torch.einsum("pgn,pn->g", W, X[:, -1])))[None]
+
+    S, right = by_chunks(len(voters), chunk, part)
+    J = torch.func.jacfwd(problem.shared_rows)(shared)
+    return S.sum(0) + J.mT @ J, right.sum(0) - J.mT @ problem.shared_rows(shared)

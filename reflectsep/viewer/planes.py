@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from reflectsep.flags import Flag
-from reflectsep.model import diffuse, edge_width, lobe, lobe_argument
+from reflectsep.model import diffuse, length, lobe_of, mixed
 from reflectsep.separation import Separation
 
 TILE = 512
@@ -41,7 +41,7 @@ class Level:
     d: Float[Tensor, "3 channels height width"]
     s: Float[Tensor, "3 channels height width"]
     w: Float[Tensor, "3 height width"]
-    """The lobe's root under every basis light, a + B mean_c d."""
+    """The lobe's argument under every basis light, a + B m."""
     B: Float[Tensor, "height width"]
     flags: Int[Tensor, "height width"]
     mask: Bool[Tensor, "height width"]
@@ -54,11 +54,14 @@ class Level:
 
 def full_level(separation: Separation) -> Level:
     """The parameters of a result at its own resolution."""
-    B = separation.B.mean(0)
-    w = lobe_argument(separation.d.permute(2, 3, 1, 0), B, separation.a, torch.eye(3)).permute(2, 0, 1)
-    mask = separation.mask
     return Level(
-        factor=1, d=separation.d, s=separation.s, w=w * mask, B=B, flags=separation.flags.to(torch.int64), mask=mask
+        factor=1,
+        d=separation.d,
+        s=separation.s,
+        w=separation.lobe_vector,
+        B=separation.B,
+        flags=separation.flags.to(torch.int64),
+        mask=separation.mask,
     )
 
 
@@ -148,13 +151,12 @@ def as_drawn(level: Level, scale: tuple[float, float]) -> Level:
 
 
 def relit(separation: Separation, level: Level, alpha: Float[Tensor, "3"]) -> Float[Tensor, "channels height width"]:
-    """The picture that a level gives under one light: Eqs. 20 and 21 with w = a + B d."""
+    """The picture that a level gives under one light: Eqs. 20 and 21 with w = a + B m."""
     unit, intensity = separation.unit_mix(alpha[None].to(level.d))
-    d, s = level.d.permute(2, 3, 1, 0), level.s.permute(2, 3, 1, 0)
-    shared = separation.globals
-    body = diffuse((d + s) @ unit.mT, edge_width(s, shared.softness), shared.n_d)
-    shine = lobe((level.w.permute(1, 2, 0) @ unit.mT).clamp(max=float(separation.ceiling)), shared.n_s, shared.crest)
-    return (body + shine[..., None, :])[..., 0].permute(2, 0, 1) * intensity * level.mask
+    shared, whole = separation.globals, level.d + level.s
+    body = diffuse(mixed(unit, whole), length(shared.M, whole), shared)
+    shine = lobe_of(level.w, shared, unit, separation.ceiling)
+    return (body + shine[:, None])[0] * intensity * level.mask
 
 
 def root_scale(separation: Separation) -> tuple[float, float]:

@@ -28,7 +28,7 @@ def test_round_trip_bit_for_bit(tmp_path_factory, layers):
     write_result(out, layers, document, False)
     back, read = read_result(out, list(layers))
     assert {key: read[key] for key in document} == document
-    assert read["format"] == "reflectsep-result/1"
+    assert read["format"] == "reflectsep-result/2"
     assert set(read["checksums"]) == set(layers)
     for name, planes in layers.items():
         assert set(back[name]) == set(planes)
@@ -112,7 +112,7 @@ def test_recorded_garbage_is_a_result_error(tmp_path):
     ("text", "message"),
     [
         ('{"format": "reflectsep-result/2", "checksums": {}}', "format is 'reflectsep-result/2', expected"),
-        ('{"format": "reflectsep-result/1"}', "no checksums"),
+        ('{"format": "reflectsep-result/2"}', "no checksums"),
         ("[]", "format is None"),
         ("{", "not JSON"),
     ],

@@ -142,7 +142,10 @@ function set_pane(pane, about) {
   use_program(about.channels, on.length, SHOWN[pane.show][0]);
   gl.uniform3fv(places.alpha, [...on[0].alpha, ...(on[1] || on[0]).alpha]);
   gl.uniform1fv(places.power, [on[0].power, (on[1] || on[0]).power]);
-  gl.uniform4f(places.globals, state.ns || g.n_s, g.n_d, g.softness, g.crest);
+  gl.uniform4f(places.globals, state.ns || g.n_s, g.n_d, g.softness, g.fresnel);
+  gl.uniform1i(places.ggx, about.ggx ? 1 : 0);
+  // Rows of M become columns: the shader multiplies from the left.
+  gl.uniformMatrix3fv(places.M, false, about.M.flat());
   gl.uniform1f(places.ceiling, about.ceiling ?? 1e30);
   gl.uniform1f(places.root_scale, about.scale[0]);
   gl.uniform1f(places.lobe_scale, about.scale[1]);

@@ -132,29 +132,38 @@ function about_result(about) {
   const rows = [
     ["result", about.name], ["object", about.object], ["model", about.model], ["made", about.created], ["size", `${size_text} pixels`],
     ["n_s", round(g.n_s)], ["n_d", `${round(g.n_d, 4)} (${about.n_d_source})`], ["a", g.a.map(v => round(v)).join(", ")],
-    ["shadow softness", round(g.softness)], ["lobe", g.crest > 0 ? "GGX microfacets" : "power of a cosine"], ["white", `${round(about.white)} in the capture's units, at exposure 0`],
+    ["f", round(g.f)], ["shadow softness", round(g.softness)], ["Fresnel share", round(g.fresnel)], ["lobe", about.ggx ? "GGX microfacets" : "power of a cosine"], ["white", `${round(about.white)} in the capture's units, at exposure 0`],
     ["stored as", `16-bit floats: basis lights ${error.psnr_db === null ? "exact" : error.psnr_db.toFixed(1) + " dB"} from the result, ${(100 * error.within_one).toFixed(2)} % of the values within one of 255 steps, at most ${error.largest}`],
     ...about.warnings.map(text => ["warning", text]),
   ];
   return table(rows.filter(([, text]) => text !== ""));
 }
 
-function lobe(u, n, crest) {
+const size_of = (M, v) => Math.hypot(...M.map(row => dot(row, v)));
+
+function lobe(u, size, n, ggx) {
   if (!(u > 0)) return 0;
-  if (!(crest > 0)) return u ** n;
-  const v = u / crest, w = 1 + n * (1 - Math.min(v, 1)) / 2, least = 1 + n / 2;
-  return crest ** n * ((v > 1 ? v ** n : w ** -2) - least ** -2);
+  if (!ggx) return u ** n;
+  const w = 1 + n * (1 - Math.min(u / size, 1)) / 2, least = 1 + n / 2;
+  return size ** n * (w ** -2 - least ** -2);
+}
+
+// Light that enters the body at the cosine c: T(c) of the model.
+function entered(c, g) {
+  const y = (c + Math.hypot(c, g.softness)) / 2;
+  return y * (1 - g.fresnel * (1 - Math.min(y, 1)) ** 5);
 }
 
 // Linear value of the whole picture at a pixel, the formula of the shader in double precision.
 function value_of(result, pixel) {
-  const g = PAGE.results[result].globals, n_s = state.ns || g.n_s;
+  const about = PAGE.results[result], g = about.globals, n_s = state.ns || g.n_s;
+  const full = Math.max(size_of(about.M, pixel.w), 1e-6), size = Math.min(full, about.ceiling ?? 1e30);
   const power = (base, exponent) => base > 0 ? base ** exponent : 0;
   return pixel.d.map((d, c) => lights_on(result).reduce((sum, light) => {
-    const f_d = power(state.loc, 1 / g.n_d), f_s = power(state.scat, 1 / g.n_d), s = pixel.s[c], u = Math.min(dot(pixel.w, light.alpha), PAGE.results[result].ceiling ?? 1e30);
-    const root = dot(d.map((v, k) => f_d * v + f_s * s[k]), light.alpha), edge = f_s * g.softness * Math.max(0, (s[0] + s[1] + s[2]) / 3);
-    const shine = lobe(u, n_s, g.crest);
-    return sum + light.power * (state.spec * shine + power((root + Math.hypot(root, edge)) / 2, g.n_d));
+    const f_d = power(state.loc, 1 / g.n_d), f_s = power(state.scat, 1 / g.n_d), s = pixel.s[c];
+    const roots = d.map((v, k) => f_d * v + f_s * s[k]), q = Math.max(size_of(about.M, roots), 1e-6);
+    const shine = lobe(dot(pixel.w, light.alpha) * size / full, size, n_s, about.ggx);
+    return sum + light.power * (state.spec * shine + power(q * entered(dot(roots, light.alpha) / q, g), g.n_d));
   }, 0));
 }
 function show_pixel(result, pixel) {

@@ -5,8 +5,10 @@ uniform sampler2DArray planes;    // per channel (d, B), per channel (s, low fla
 uniform sampler2DArray measured;  // one layer a light, sRGB codes
 uniform vec3 alpha[2];            // of lights of unit intensity
 uniform float power[2];           // their intensities
-uniform vec4 globals;             // n_s, n_d, softness, crest
-uniform float ceiling;            // largest argument of the lobe
+uniform vec4 globals;             // n_s, n_d, softness, Fresnel share
+uniform bool ggx;                 // the lobe of GGX microfacets, not a power
+uniform mat3 M;                   // inverse of the basis directions, transposed
+uniform float ceiling;            // largest |M w|
 uniform float root_scale;
 uniform float lobe_scale;         // of B
 uniform vec3 faders;              // of the specular, and of the roots of local diffuse and scattering
@@ -32,17 +34,24 @@ float positive_power(float base, float exponent) {
   return exponent == 1.0 ? base : pow(base, exponent);
 }
 
-// (x + sqrt(x^2 + e^2)) / 2: max(x, 0) with an edge of width e
-float soft_positive(float x, float e) { return 0.5 * (x + sqrt(x * x + e * e)); }
+// T(c): light that enters the body at the cosine c
+float entered(float c) {
+  float y = 0.5 * (c + sqrt(c * c + globals.z * globals.z)), rest = 1.0 - min(y, 1.0);
+  return y * (1.0 - globals.w * rest * rest * rest * rest * rest);
+}
 
-// off-specular value of u = A (a + B d): Eq. 17, or the lobe of GGX microfacets where there is a crest
-float lobe(float u) {
-  u = min(u, ceiling);
-  float n = globals.x, crest = globals.w;
-  if (!(crest > 0.0)) return positive_power(u, n);
+float diffuse(vec3 roots, vec3 mix_) {
+  float q = max(length(roots * M), 1e-6);
+  return positive_power(q * entered(dot(roots, mix_) / q), globals.y);
+}
+
+// off-specular value of w = a + B m under a light: Eq. 17, or the lobe of GGX microfacets
+float lobe(vec3 w, vec3 mix_) {
+  float n = globals.x, full = max(length(w * M), 1e-6), size = min(full, ceiling), u = dot(w, mix_) * size / full;
+  if (!ggx) return positive_power(u, n);
   if (!(u > 0.0)) return 0.0;
-  float v = u / crest, w = 1.0 + 0.5 * n * (1.0 - min(v, 1.0)), least = 1.0 + 0.5 * n;
-  return pow(crest, n) * ((v > 1.0 ? pow(v, n) : 1.0 / (w * w)) - 1.0 / (least * least));
+  float base = 1.0 + 0.5 * n * (1.0 - min(u / size, 1.0)), least = 1.0 + 0.5 * n;
+  return pow(size, n) * (1.0 / (base * base) - 1.0 / (least * least));
 }
 
 // Eqs. 20 and 21 of one channel under one light
@@ -55,12 +64,10 @@ float value(vec3 d, vec3 s, float shine, vec3 mix_) {
 #elif SHOW == 3
   return positive_power(dot(s, mix_), n_d);
 #else
-  float edge = globals.z * max((s.x + s.y + s.z) / 3.0, 0.0);
 #if SHOW == 4
-  return positive_power(soft_positive(dot(d + s, mix_), edge), n_d);
+  return diffuse(d + s, mix_);
 #else
-  float root = soft_positive(dot(faders.y * d + faders.z * s, mix_), faders.z * edge);
-  return faders.x * shine + positive_power(root, n_d);
+  return faders.x * shine + diffuse(faders.y * d + faders.z * s, mix_);
 #endif
 #endif
 }
@@ -69,9 +76,9 @@ float value(vec3 d, vec3 s, float shine, vec3 mix_) {
 float channel(ivec2 p, int c, vec3 w) {
   vec3 d = root_scale * texelFetch(planes, ivec3(p, c), 0).xyz;
   vec3 s = root_scale * texelFetch(planes, ivec3(p, CHANNELS + c), 0).xyz;
-  float sum = power[0] * value(d, s, lobe(dot(w, alpha[0])), alpha[0]);
+  float sum = power[0] * value(d, s, lobe(w, alpha[0]), alpha[0]);
 #if LIGHTS == 2
-  sum += power[1] * value(d, s, lobe(dot(w, alpha[1])), alpha[1]);
+  sum += power[1] * value(d, s, lobe(w, alpha[1]), alpha[1]);
 #endif
   return sum;
 }
