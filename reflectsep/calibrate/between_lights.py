@@ -58,6 +58,8 @@ BETTER, BETTER_SD = 0.1, 3.0
 DRAWS = 4.0
 """Independent tiles, at least: one shadow's edge in two of them is no proof."""
 BEYOND_SD = 5.0
+SURE_PX = 0.11
+"""Largest standard deviation of a proven motion, of the level's pixels: where tiles pull apart, shading has a part."""
 FLOOR_PX = 0.05
 TURN_FLOOR_PX = 0.1
 """Systematic errors of a motion between lights, of the level's pixels: of the shift, and of a rotation at the rim."""
@@ -177,6 +179,8 @@ def _doubt(pair: _Pair, found: _Fit, likeness: float, reach: int) -> tuple[str, 
         return "nothing beyond its error", ""
     if math.hypot(*far) > reach or abs(_degrees(found.matrix)) > TURN_DEG:
         return "what looks like one is implausibly far", ""
+    if found.sd_px > SURE_PX:
+        return "places pull apart", ""
     if found.draws < DRAWS:
         return "what looks like one rests on too few places", ""
     if likeness < LIKE:

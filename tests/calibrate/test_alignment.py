@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from reflectsep.calibrate import across_lights, alignment
+from reflectsep.calibrate import alignment
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.aligned_stream import aligned_stream
 from reflectsep.calibrate.alignment import Alignment, align, covered
