@@ -36,6 +36,7 @@ from reflectsep.solve.sharing import by_items
 
 CLIPPED_SHARE = 0.5
 CLIPPED_BESIDE = 0.01
+NOT_LOOKED_FOR = "not looked for"
 SIDE_BY_SIDE_PX = 1 << 22
 """Larger pictures are registered one after the other, in the memory of one."""
 
@@ -91,11 +92,27 @@ class Alignment:
         """Developed frames of the capture's sweep `i` as the first basis picture has them."""
         return aligned_stream(stream, self.sweeps[i], self._exposures()[i])
 
+    def told(self, capture: Capture) -> str:
+        """What was moved and by how much, in a line; and what was looked for and not found."""
+        lights = [f"{name} by {m.displacement_px:.2f} px" for name, m in self.pictures.items() if m.applied]
+        looked = any(m.reason not in ("reference", NOT_LOOKED_FOR) for m in self.pictures.values())
+        unmoved = "no motion between lights proven" if looked else "motion between lights not looked for"
+        parts = [f"moved between lights: {', '.join(lights)}" if lights else unmoved]
+        if self.against_full:
+            sweeps = [
+                f"{sweep.light} along {sweep.direction} by {m.displacement_px:.2f} px"
+                for sweep, m in zip(capture.sweeps, self.against_full, strict=True)
+                if m.applied
+            ]
+            parts.append(f"sweeps moved: {', '.join(sweeps)}" if sweeps else "no sweep moved")
+        return "; ".join(parts)
+
     def document(self, capture: Capture) -> dict[str, Any]:
         """As it stands in `separation.json`."""
         return {
             "reference": capture.basis[0],
             "size": None if self.size is None else list(self.size),
+            "told": self.told(capture),
             "pictures": {name: motion.document() for name, motion in self.pictures.items()},
             "sweeps": [
                 {"light": sweep.light, "direction": sweep.direction, **motion.document()}
@@ -158,7 +175,7 @@ def align(
         own = roots_of(picture, options.n_d).mean(0)
         good[i] = ~saturated[i].any(0) & torch.isfinite(own)
         grey[i] = torch.where(torch.isfinite(own), own, 0.0)
-    motions = {name: Motion(reason="reference" if i == 0 else "not looked for") for i, name in enumerate(names)}
+    motions = {name: Motion(reason="reference" if i == 0 else NOT_LOOKED_FOR) for i, name in enumerate(names)}
     if options.scope == "all":
         finished, turn = itertools.count(1), threading.Lock()
         anchor = anchored(grey[0], mask)
