@@ -23,7 +23,7 @@ from torch import Tensor
 
 from reflectsep.calibrate.evidence import exceeds, on_unseen, sd_px_of
 from reflectsep.calibrate.motion import Model, displacement
-from reflectsep.calibrate.motion_fit import FEWEST_PIXELS, solve_motion
+from reflectsep.calibrate.motion_fit import FEWEST_PIXELS, MotionState, solve_motion
 from reflectsep.calibrate.pyramid import Level, from_level, pyramid_of, to_level
 from reflectsep.calibrate.register_options import RegisterOptions
 from reflectsep.errors import CaptureError
@@ -92,10 +92,13 @@ def register(
 
 
 def _coarse(pyramid: Sequence[Level], options: RegisterOptions) -> Tensor:
-    """Translation, then a rigid motion, from the coarsest level to the finest; in the finest's coordinates."""
+    """Translation, then a rigid motion, from the coarsest level to the finest but one; in the finest's coordinates.
+
+    At the finest level every model is fitted for itself.
+    """
     finest = pyramid[-1]
     best = torch.eye(3, dtype=torch.float64)
-    for level in pyramid:
+    for level in pyramid[:-1] or pyramid:
         ratio = level.factor // finest.factor
         local = to_level(best, ratio)
         for model in ("translation", "rigid"):
@@ -109,12 +112,14 @@ def _coarse(pyramid: Sequence[Level], options: RegisterOptions) -> Tensor:
 def _choose(
     level: Level, start: Tensor, candidates: Sequence[tuple[Model, bool]], usable: Tensor, options: RegisterOptions
 ) -> Registration:
-    fits = {}
-    for model, drifting in candidates:
-        fits[model, drifting] = solve_motion(level, model, _restricted(start, model, level), options, drifting=drifting)
+    fits: dict[tuple[Model, bool], MotionState] = {}
     chosen = candidates[0]
-    for candidate in candidates[1:]:
-        if exceeds(fits[candidate], chosen, candidate, level, options):
+    for candidate in candidates:
+        model, drifting = candidate
+        if model == "homography" and chosen[0] != "affine":
+            continue  # a camera that tilts by enough to converge shears as well
+        fits[candidate] = solve_motion(level, model, _restricted(start, model, level), options, drifting=drifting)
+        if candidate != candidates[0] and exceeds(fits[candidate], chosen, candidate, level, options):
             chosen = candidate
     fall, significance = 0.0, 0.0
     if chosen != candidates[0]:
