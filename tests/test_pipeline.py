@@ -303,6 +303,7 @@ def test_without_sweeps_the_fit_is_lin_and_lee_and_says_so(captured):
     assert separation.document["settings"]["fit"]["method"] == "two_step"
     assert not separation.scattering.any()
     assert "no sweeps" in summary(separation)
+    assert "motion    no motion between lights proven" in summary(separation)
 
 
 def test_settings_by_keyword_are_checked(captured):

@@ -4,9 +4,9 @@ Same light: the sum of a sweep's n_d-roots is the full picture again (Eq. 25), u
 pictures of the same thing. A sweep that drifts slowly shows each pixel as it lay when the slab passed it, so that the
 drift is a part of the motion that goes with the passage (`Motion.velocity`).
 
-Pictures under other lights: `between_lights`, where nothing moves without proof. No picture is moved by less than what
-stands beyond its uncertainty, and none by less than `align_options.LEAST_PX`. Motions are composed, so that a picture is
-resampled once.
+Pictures under other lights: `between_lights`, where nothing moves without proof. No sweep is moved by less than what
+stands beyond its uncertainty, and none by less than `align_options.LEAST_PX`. Motions are composed, so that a picture
+is resampled once.
 """
 
 from __future__ import annotations

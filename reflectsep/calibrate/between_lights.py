@@ -1,15 +1,13 @@
 """Motion between pictures under different lights, and the proof that it asks for.
 
 What goes with the light and not with the camera (shading, shadows, highlights, outlines that are lit from one side)
-looks like motion, over the whole object alike and by pixels. What stays on the surface is fine structure of the
-logarithm: albedo is a summand there, whatever the light.
+looks like motion, over the whole object alike and by pixels. Proof is sought in what stays on the surface alone:
 
-    f = whitened (G_fine - G_coarse) * log(I / bright + SMALL),      f_k(S x) = c f_1(x)
+    f_k(S x) = c f_1(x),      f the fine structure of the logarithm (`structure`), S a shift or a rigid motion
 
-Whitened, every frequency has one vote, as in phase correlation: otherwise the contrast of shaded relief outvotes print.
-S is found as the peak of the correlation, then by robust least squares, which sees a rotation besides. The object is cut
-into tiles: they are the independent draws of the standard deviation, and each half of them, split like a chessboard,
-must confirm what the other half found. A motion is undone only where `_doubt` has nothing to say.
+S is found as the peak of the correlation, then by robust least squares, which sees a rotation besides. The object is
+cut into tiles: they are the independent draws of the standard deviation, and each half of them, split like a
+chessboard, must confirm what the other half found. A motion is undone only where `_doubt` has nothing to say.
 """
 
 from __future__ import annotations
@@ -20,37 +18,31 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
 
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.motion import Motion, displacement, inside, positions, sample, shifted
 from reflectsep.calibrate.pyramid import MAD_TO_SIGMA, blurred, from_level
+from reflectsep.calibrate.structure import RIM_PX, Structure, halved, padded, structure_of
 from reflectsep.calibrate.tiles import chessboard, per_tile, tile_index
 
 MOST_PIXELS = 150_000
 """The object's box is halved until it has no more: a tenth of a pixel is still seen there."""
-SMALL = 0.05
-"""Of the picture's bright end: darker values are noise in the logarithm."""
-DARK = 0.1
-"""Of the bright end: what is darker over more than `STROKE_PX` to all sides is shadow or background, not print."""
-STROKE_PX = 3
-FINE_PX, COARSE_PX = 0.8, 2.0
-RIM_PX = 5
-"""Within so many pixels of the object's rim and of a shadow nothing counts: such edges go with the light."""
 FEWEST_PIXELS = 256
 TILES = 6
 """Along each side."""
 ITERATIONS, FURTHER = 8, 3
 """Of least squares, from the peak of the correlation and from another fit."""
+SETTLED_PX = 0.005
+"""A step this small is the last."""
 TUKEY = 4.685
 NOISE_FLOOR = 0.05
 """Least residual, as a share of the structure's RMS, that is told from agreement."""
 REACH, LEAST_REACH_PX = 0.02, 4
 """Of the picture's longer side, and pixels of the level: a camera that moved further was set up anew."""
 TURN_DEG = 2.0
-AGREE_PX = 0.25
-"""Between the two estimates, and between the halves of the object; on still captures they are pixels apart
-(table in README.md)."""
+AGREE_PX, SIDES_PX = 0.25, 0.8
+"""Between the two estimates and between the halves of the tiles; between left and right and top and bottom, which a
+turn too small to be told from none pulls apart. On still smooth objects they are pixels apart."""
 LIKE = 0.35
 """Correlation of the structures once they are in one place: below it most of them is not the surface's."""
 BETTER, BETTER_SD = 0.1, 3.0
@@ -63,16 +55,6 @@ SURE_PX = 0.11
 FLOOR_PX = 0.05
 TURN_FLOOR_PX = 0.1
 """Systematic errors of a motion between lights, of the level's pixels: of the shift, and of a rotation at the rim."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Structure:
-    """What of a picture is compared, in the object's box at the level."""
-
-    values: Float[Tensor, "rows columns"]
-    """Whitened fine structure of the logarithm, of RMS 1 where it counts."""
-    weight: Float[Tensor, "rows columns"]
-    """1 where it counts: away from the object's rim, from shadows and from whatever else is dark."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +99,17 @@ class _Fit:
         return math.sqrt(x + y + 0.25 * turn + 2 * FLOOR_PX**2)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _System:
+    """Normal equations of shift, rotation and gain."""
+
+    normal: Tensor
+    force: Tensor
+    """Gradient, of every tile (tiles, unknowns)."""
+    told: Tensor
+    """Squared slopes that count, of every tile."""
+
+
 def anchored(picture: Float[Tensor, "height width"], mask: Bool[Tensor, "height width"]) -> Anchor:
     """Prepare the picture that others are compared with.
 
@@ -130,8 +123,8 @@ def anchored(picture: Float[Tensor, "height width"], mask: Bool[Tensor, "height 
     factor = 1
     while box.numel() > MOST_PIXELS * factor**2 and 2 * factor <= min(box.shape):
         factor *= 2
-    inner = (_halved(box.float(), factor) > 0.5).double()
-    structure = _structure(picture, (top, left), inner, factor)
+    inner = (halved(box.float(), factor) > 0.5).double()
+    structure = structure_of(picture, (top, left), inner, factor)
     return Anchor(mask=mask, corner=(top, left), inner=inner, factor=factor, structure=structure)
 
 
@@ -144,7 +137,7 @@ def between(anchor: Anchor, picture: Float[Tensor, "height width"], options: Ali
         options: settings; of the models a translation and a rotation at most are looked for.
     """
     options = options or AlignOptions()
-    moving = _structure(picture, anchor.corner, anchor.inner, anchor.factor)
+    moving = structure_of(picture, anchor.corner, anchor.inner, anchor.factor)
     weight = anchor.structure.weight * moving.weight
     if int(weight.sum()) < FEWEST_PIXELS:
         return Motion(reason="no motion proven: too little of the object is lit in both pictures")
@@ -187,55 +180,36 @@ def _doubt(pair: _Pair, found: _Fit, likeness: float, reach: int) -> tuple[str, 
         return "the surface shows no texture", ""
     if math.hypot(*_peak(replace(pair, moving=_moved(pair, found.matrix)), reach)) > AGREE_PX:
         return "two estimates do not agree", ""
-    halves = [
-        _fitted(replace(pair, weight=pair.weight * half), found.matrix, FURTHER).matrix
-        for half in chessboard(pair.weight, TILES)
-    ]
+    halves = _halves(pair, found, chessboard(pair.weight, TILES))
     if math.dist(*(_moved_by(matrix, pair) for matrix in halves)) > AGREE_PX:
         return "parts of the object do not agree", ""
+    for sides in _sides(pair.weight):
+        if math.dist(*(_moved_by(matrix, pair) for matrix in _halves(pair, found, sides))) > SIDES_PX:
+            return "sides of the object do not agree", ""
     before, after, beyond_sd = _on_unseen(pair, halves)
     if after - before < BETTER or beyond_sd < BETTER_SD:
         return "unseen parts do not agree better", ""
     return "", f"proven by fine structure: unseen parts correlate by {after:.2f}, unmoved by {before:.2f}"
 
 
-def _structure(picture: Tensor, corner: tuple[int, int], inner: Tensor, factor: int) -> Structure:
-    """Fine structure of a picture's logarithm inside the object, and where it is the surface's."""
-    (top, left), (rows, columns) = corner, (length * factor for length in inner.shape)
-    values = _halved(picture[top : top + rows, left : left + columns], factor).double().clamp_min(0)
-    on_object = values[inner > 0]
-    bright = on_object.kthvalue(max(1, round(0.9 * on_object.numel()))).values.clamp_min(1e-12)
-    lit = inner * _shrunk((_grown(values, STROKE_PX) > DARK * bright).double(), STROKE_PX)
-    logarithm = torch.log(values / bright + SMALL) * lit
-    # Blurs count lit pixels alone, so that outlines and shadows leave no edge.
-    fine, coarse = (blurred(torch.stack([logarithm, lit]), width) for width in (FINE_PX, COARSE_PX))
-    structure = (fine[0] / fine[1].clamp_min(1e-3) - coarse[0] / coarse[1].clamp_min(1e-3)) * lit
-    weight = torch.zeros_like(lit)
-    weight[RIM_PX:-RIM_PX, RIM_PX:-RIM_PX] = _shrunk(lit, RIM_PX)[RIM_PX:-RIM_PX, RIM_PX:-RIM_PX]
-    whitened = _whitened(structure * blurred(_shrunk(lit, STROKE_PX)[None], COARSE_PX)[0])
-    rms = (whitened.square() * weight).sum() / weight.sum().clamp_min(1.0)
-    return Structure(values=whitened / rms.sqrt().clamp_min(1e-300), weight=weight)
+def _halves(pair: _Pair, found: _Fit, halves: tuple[Tensor, Tensor]) -> list[Tensor]:
+    """Motions of two halves of the object, each for itself."""
+    return [_fitted(replace(pair, weight=pair.weight * half), found.matrix, FURTHER).matrix for half in halves]
 
 
-def _whitened(values: Tensor) -> Tensor:
-    """All frequencies of a map at one amplitude, up to those that its grid carries well."""
-    spectrum = torch.fft.rfft2(values, _fast(values.shape))
-    size = spectrum.abs()
-    y, x = torch.fft.fftfreq(size.shape[0]).double()[:, None], torch.fft.rfftfreq(2 * size.shape[1] - 2).double()
-    low = torch.exp(-2 * (math.pi * FINE_PX) ** 2 * (x.square() + y.square()))
-    white = spectrum * low / (size + 0.05 * size.mean() + 1e-300)
-    return torch.fft.irfft2(white, _fast(values.shape))[: values.shape[0], : values.shape[1]]
-
-
-def _fast(shape: torch.Size) -> list[int]:
-    """Even lengths with small factors that leave a margin, for a transform that does not meet its other end."""
-    return [64 * math.ceil((length + 4 * RIM_PX) / 64) for length in shape]
+def _sides(weight: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """1 on the left and on the right of the object's middle; on its top and on its bottom."""
+    y, x = ((weight > 0).nonzero(as_tuple=True)[axis].double().median() for axis in (0, 1))
+    height, width = weight.shape
+    left = (torch.arange(width) < x).double().expand(height, width)
+    top = (torch.arange(height)[:, None] < y).double().expand(height, width)
+    return [(left, 1.0 - left), (top, 1.0 - top)]
 
 
 def _peak(pair: _Pair, reach: int) -> tuple[float, float]:
     """(x, y) at the highest correlation within `reach`, to a fraction of a pixel by a parabola."""
     window = blurred(pair.weight[None], RIM_PX / 2)[0]
-    shape = _fast(window.shape)
+    shape = padded(window.shape)
     still, moving = (torch.fft.rfft2(each * window, shape) for each in (pair.still, pair.moving))
     surface = torch.fft.irfft2(still.conj() * moving, shape)
     reach = min(reach, min(shape) // 2 - 2)
@@ -255,45 +229,53 @@ def _vertex(three: Tensor) -> float:
 def _fitted(pair: _Pair, start: Tensor, iterations: int, *, turning: bool = False) -> _Fit:
     """Gauss-Newton on shift, rotation where `turning`, and gain, with Tukey's weights."""
     height, width = pair.still.shape
-    middle = ((width - 1) / 2, (height - 1) / 2)
-    x = torch.arange(width, dtype=torch.float64) - middle[0]
-    y = torch.arange(height, dtype=torch.float64)[:, None] - middle[1]
-    rim, own, matrix = max(height, width) / 2, _slopes(pair.still), start
+    middle, rim, matrix = ((width - 1) / 2, (height - 1) / 2), max(height, width) / 2, start
+    slopes = _slopes(pair.still)
+    system = _linearised(pair, slopes, matrix, turning)
     for _ in range(iterations):
-        moved = _moved(pair, matrix)
-        gain, residual, counts = _left(pair, moved, matrix)
-        gx, gy = 0.5 * (_slopes(moved) + gain * own)  # of both sides: converges in a handful of steps
-        columns = torch.stack([gx, gy, *([(gy * x - gx * y) / rim] if turning else []), -pair.still]).flatten(1)
-        system, error = columns * counts.flatten(), residual.flatten()
-        normal = system @ columns.mT
-        normal += 1e-9 * normal.diagonal().mean().clamp_min(1e-300) * torch.eye(len(normal), dtype=torch.float64)
-        step = -torch.linalg.solve(normal, system @ error)
+        step = -torch.linalg.solve(system.normal, system.force.sum(0))
         step = (step / step[:-1].norm().clamp_min(1.0)).tolist()  # a linearisation holds for a pixel
         turn = math.degrees(step[2] / rim) if turning else 0.0
         matrix = matrix @ shifted(step[0], step[1], turn, middle)
-        if max(map(abs, step[:-1])) < 0.005:
+        if max(map(abs, step[:-1])) < SETTLED_PX:
             break
-    force = torch.zeros(TILES**2, len(normal), dtype=torch.float64)
-    force.index_add_(0, tile_index(pair.weight, TILES).flatten(), (system * error).mT)
-    inverse, kept = torch.linalg.inv(normal), len(normal) - 1
+        system = _linearised(pair, slopes, matrix, turning)
+    inverse, kept = torch.linalg.inv(system.normal), len(system.normal) - 1
     covariance = torch.zeros(3, 3, dtype=torch.float64)
-    covariance[:kept, :kept] = (inverse @ force.mT @ force @ inverse)[:kept, :kept]
-    told, _ = per_tile(gx.square() + gy.square(), counts, TILES)
+    covariance[:kept, :kept] = (inverse @ system.force.mT @ system.force @ inverse)[:kept, :kept]
     return _Fit(
         matrix=matrix,
         covariance=covariance,
         turn_px=math.radians(_degrees(matrix)) * rim,
-        draws=float(told.sum().square() / told.square().sum().clamp_min(1e-300)),
+        draws=float(system.told.sum().square() / system.told.square().sum().clamp_min(1e-300)),
     )
 
 
+def _linearised(pair: _Pair, slopes: Tensor, matrix: Tensor, turning: bool) -> _System:
+    height, width = pair.still.shape
+    x = torch.arange(width, dtype=torch.float64) - (width - 1) / 2
+    y = torch.arange(height, dtype=torch.float64)[:, None] - (height - 1) / 2
+    moved = _moved(pair, matrix)
+    gain, residual, counts = _left(pair, moved, matrix)
+    gx, gy = 0.5 * (_slopes(moved) + gain * slopes)  # of both sides: converges in a handful of steps
+    turned = [(gy * x - gx * y) / (max(height, width) / 2)] if turning else []
+    columns = torch.stack([gx, gy, *turned, -pair.still]).flatten(1)
+    weighed = columns * counts.flatten()
+    normal = weighed @ columns.mT
+    normal += 1e-9 * normal.diagonal().mean().clamp_min(1e-300) * torch.eye(len(normal), dtype=torch.float64)
+    force = torch.zeros(TILES**2, len(normal), dtype=torch.float64)
+    force.index_add_(0, tile_index(pair.weight, TILES).flatten(), (weighed * residual.flatten()).mT)
+    told, _ = per_tile(gx.square() + gy.square(), counts, TILES)
+    return _System(normal=normal, force=force, told=told)
+
+
 def _moved(pair: _Pair, matrix: Tensor) -> Tensor:
-    return sample(pair.moving[None], positions(matrix, *pair.still.shape))[0]
+    return sample(pair.moving[None], positions(matrix, pair.still.shape[0], pair.still.shape[1]))[0]
 
 
 def _left(pair: _Pair, moved: Tensor, matrix: Tensor) -> tuple[float, Tensor, Tensor]:
     """Gain of the moved structure, the residual, and robust weights."""
-    valid = pair.weight * inside(positions(matrix, *moved.shape))
+    valid = pair.weight * inside(positions(matrix, moved.shape[0], moved.shape[1]))
     gain = float((moved * pair.still * valid).sum() / (pair.still.square() * valid).sum().clamp_min(1e-300))
     gain = max(0.1, gain)
     residual = moved - gain * pair.still
@@ -340,17 +322,3 @@ def _moved_by(matrix: Tensor, pair: _Pair) -> tuple[float, float]:
 
 def _degrees(matrix: Tensor) -> float:
     return Motion(matrix=matrix).rotation_deg
-
-
-def _halved(values: Tensor, factor: int) -> Tensor:
-    return avg_pool2d(values[None], factor)[0] if factor > 1 else values
-
-
-def _grown(values: Tensor, pixels: int) -> Tensor:
-    """The largest value within so many pixels along both axes."""
-    return max_pool2d(values[None], 2 * pixels + 1, stride=1, padding=pixels)[0]
-
-
-def _shrunk(values: Tensor, pixels: int) -> Tensor:
-    """The least value within so many pixels along both axes."""
-    return -_grown(-values, pixels)

@@ -2,9 +2,9 @@
 
     moving(sample_p(x)) = c template(x) + b          for most pixels x
 
-c and b are free, so that an unknown exposure ratio (C of Eq. 25) does no harm. Gauss-Newton on p, c and b together, Tukey's biweight whose scale is let down
-from the first residual to the noise; the gradient is the mean of both sides', which converges in a handful of steps.
-The moving picture is always resampled from the original.
+c and b are free, so that an unknown exposure ratio (C of Eq. 25) does no harm. Gauss-Newton on p, c and b together,
+Tukey's biweight whose scale is let down from the first residual to the noise; the gradient is the mean of both sides',
+which converges in a handful of steps. The moving picture is always resampled from the original.
 
 Evidence: of the nested models (none, translation, rigid, affine, homography) a richer one is taken where its further
 parameters differ from nothing beyond chance (Wald; a covariance with the tiles of the picture as independent draws,
