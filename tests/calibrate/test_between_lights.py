@@ -185,6 +185,33 @@ def test_the_sides_of_the_object_must_agree(monkeypatch, vertical):
     assert between(anchor, picture, only).reason == "no motion proven: places pull apart"
 
 
+def test_tiles_that_pull_apart_are_no_camera():
+    pictures, mask = dome(print_())
+    anchor = anchored(pictures[0], mask)
+    left = torch.zeros_like(anchor.structure.weight)
+    left[:, : left.shape[1] // 2] = 1.0
+    picture = patchwork(anchor, pictures[0], left, (2.0, 0.4))
+    found = between(anchor, picture, AlignOptions(richest="translation"))
+    assert found.reason == "no motion proven: places pull apart"
+
+
+@pytest.mark.parametrize("side", [36, 0])
+def test_every_tile_has_a_vote(side):
+    """What moves in the middle does not speak for the faint marks around it, which stay."""
+    _, mask = dome()
+    middle = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    near = slice((SIZE - side) // 2, (SIZE + side) // 2)
+    middle[near, near] = True
+    strong, faint = 0.5 * print_(), 0.35 + 0.07 * (print_(8) - 0.7)
+    still = torch.where(middle, strong, faint) * mask
+    around = faint if side else moved(faint[None], shifted(1.0, 0.6))[0]
+    picture = torch.where(middle, moved(strong[None], shifted(1.0, 0.6))[0], around) * mask
+    motion = between(anchored(still + noise(0.001, 1), mask), picture + noise(0.001, 2))
+    assert motion.applied == (side == 0)
+    if side:
+        assert motion.reason == "no motion proven: unseen parts do not agree better"
+
+
 def test_the_correlation_must_have_its_peak_where_least_squares_have_put_it(monkeypatch):
     pictures, mask = dome(print_())
     peaks = iter([(1.0, 0.5), (0.2, 0.2)])
