@@ -157,7 +157,8 @@ def between(anchor: Anchor, picture: Float[Tensor, "height width"], options: Ali
     return Motion(
         matrix=matrix,
         model=model,
-        displacement_px=displacement(matrix, anchor.mask),
+        displacement_px=anchor.factor
+        * displacement(best.matrix, anchor.inner > 0),  # the whole picture's grid is large
         sd_px=best.sd_px * anchor.factor,
         trust=likeness,
         applied=True,
@@ -174,16 +175,18 @@ def _doubt(pair: _Pair, found: _Fit, likeness: float, reach: int) -> tuple[str, 
         return "what looks like one is implausibly far", ""
     if found.sd_px > SURE_PX:
         return "places pull apart", ""
-    if found.draws < DRAWS:
+    parts = [chessboard(pair.weight, TILES), *_sides(pair.weight)]
+    fewest = min(float((pair.weight * half).sum()) for halves in parts for half in halves)
+    if found.draws < DRAWS or fewest < FEWEST_PIXELS / 8:
         return "what looks like one rests on too few places", ""
     if likeness < LIKE:
         return "the surface shows no texture", ""
     if math.hypot(*_peak(replace(pair, moving=_moved(pair, found.matrix)), reach)) > AGREE_PX:
         return "two estimates do not agree", ""
-    halves = _halves(pair, found, chessboard(pair.weight, TILES))
+    halves = _halves(pair, found, parts[0])
     if math.dist(*(_moved_by(matrix, pair) for matrix in halves)) > AGREE_PX:
         return "parts of the object do not agree", ""
-    for sides in _sides(pair.weight):
+    for sides in parts[1:]:
         if math.dist(*(_moved_by(matrix, pair) for matrix in _halves(pair, found, sides))) > SIDES_PX:
             return "sides of the object do not agree", ""
     before, after, beyond_sd = _on_unseen(pair, halves)
