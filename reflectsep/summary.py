@@ -134,6 +134,8 @@ def summary(separation: Separation, *, full: bool = False) -> str:
     a = ", ".join(f"{v:.3f}" for v in separation.a.tolist())
     rms = document.get("residual", {}).get("rms", float("nan"))
     lines = [f"{document.get('model', '')}; a = ({a}), {globals_}, residual {rms:.2g} rms"]
+    if document.get("alignment", {}).get("told"):
+        lines.append(f"  motion    {document['alignment']['told']}")
     lines += [f"  warning: {text}" for text in document.get("warnings", [])]
     if full:
         lines.insert(0, f"result of {document.get('object', '?')} from {document.get('capture', '?')}")

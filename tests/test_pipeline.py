@@ -251,7 +251,8 @@ def test_lin_and_lee_beside_is_moved_as_the_result_was(result, captured, monkeyp
     told = dataclasses.replace(separation, document={**separation.document, "alignment": document})
     monkeypatch.setattr(pipeline, "align", None)  # it does not look again
     beside = recorded.lin_lee_beside(told, reflectsep.load_capture(captured), QUICK, lambda *_: None)
-    assert beside.document["alignment"] == document
+    assert {**beside.document["alignment"], "told": document["told"]} == document
+    assert beside.document["alignment"]["told"] == f"moved between lights: {moved} by 0.00 px; no sweep moved"
     assert 0 < beside.mask.sum() < separation.mask.sum()  # what came from outside is none of it
 
 
@@ -303,6 +304,7 @@ def test_without_sweeps_the_fit_is_lin_and_lee_and_says_so(captured):
     assert separation.document["settings"]["fit"]["method"] == "two_step"
     assert not separation.scattering.any()
     assert "no sweeps" in summary(separation)
+    assert "motion    no motion between lights proven" in summary(separation)
 
 
 def test_settings_by_keyword_are_checked(captured):

@@ -46,7 +46,7 @@ def judged(found: Registration, mask: Tensor) -> Motion:
         displacement_px=whole,
         sd_px=found.sd_px,
         trust=found.trust,
-        gain=float(found.coefficients[0]),
+        gain=found.gain,
     )
     if found.model == "identity" and drift == 0:
         return replace(motion, reason="no motion beyond chance")

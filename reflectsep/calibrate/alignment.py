@@ -4,8 +4,9 @@ Same light: the sum of a sweep's n_d-roots is the full picture again (Eq. 25), u
 pictures of the same thing. A sweep that drifts slowly shows each pixel as it lay when the slab passed it, so that the
 drift is a part of the motion that goes with the passage (`Motion.velocity`).
 
-Pictures under other lights: `across_lights`. No picture is moved by less than what stands beyond its uncertainty, and
-none by less than `align_options.LEAST_PX`. Motions are composed, so that a picture is resampled once.
+Pictures under other lights: `between_lights`, where nothing moves without proof. No sweep is moved by less than what
+stands beyond its uncertainty, and none by less than `align_options.LEAST_PX`. Motions are composed, so that a picture
+is resampled once.
 """
 
 from __future__ import annotations
@@ -20,11 +21,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.calibrate.across_lights import across
 from reflectsep.calibrate.align_options import MARGIN_PX, AlignOptions, grown, judged
 from reflectsep.calibrate.aligned_stream import after, aligned_stream
-from reflectsep.calibrate.alpha import light_vector
-from reflectsep.calibrate.among_lights import checked_among_lights
+from reflectsep.calibrate.between_lights import anchored, between
 from reflectsep.calibrate.bracket_motion import bracket_motions
 from reflectsep.calibrate.motion import Motion, displacement, inside, positions, shifted, warp
 from reflectsep.calibrate.register import RegisterOptions, register
@@ -37,6 +36,7 @@ from reflectsep.solve.sharing import by_items
 
 CLIPPED_SHARE = 0.5
 CLIPPED_BESIDE = 0.01
+NOT_LOOKED_FOR = "not looked for"
 SIDE_BY_SIDE_PX = 1 << 22
 """Larger pictures are registered one after the other, in the memory of one."""
 
@@ -92,11 +92,27 @@ class Alignment:
         """Developed frames of the capture's sweep `i` as the first basis picture has them."""
         return aligned_stream(stream, self.sweeps[i], self._exposures()[i])
 
+    def told(self, capture: Capture) -> str:
+        """What was moved and by how much, in a line; and what was looked for and not found."""
+        lights = [f"{name} by {m.displacement_px:.2f} px" for name, m in self.pictures.items() if m.applied]
+        looked = any(m.reason not in ("reference", NOT_LOOKED_FOR) for m in self.pictures.values())
+        unmoved = "no motion between lights proven" if looked else "motion between lights not looked for"
+        parts = [f"moved between lights: {', '.join(lights)}" if lights else unmoved]
+        if self.against_full:
+            sweeps = [
+                f"{sweep.light} along {sweep.direction} by {m.displacement_px:.2f} px"
+                for sweep, m in zip(capture.sweeps, self.against_full, strict=True)
+                if m.applied
+            ]
+            parts.append(f"sweeps moved: {', '.join(sweeps)}" if sweeps else "no sweep moved")
+        return "; ".join(parts)
+
     def document(self, capture: Capture) -> dict[str, Any]:
         """As it stands in `separation.json`."""
         return {
             "reference": capture.basis[0],
             "size": None if self.size is None else list(self.size),
+            "told": self.told(capture),
             "pictures": {name: motion.document() for name, motion in self.pictures.items()},
             "sweeps": [
                 {"light": sweep.light, "direction": sweep.direction, **motion.document()}
@@ -159,12 +175,13 @@ def align(
         own = roots_of(picture, options.n_d).mean(0)
         good[i] = ~saturated[i].any(0) & torch.isfinite(own)
         grey[i] = torch.where(torch.isfinite(own), own, 0.0)
-    motions = {name: Motion(reason="reference" if i == 0 else "not looked for") for i, name in enumerate(names)}
+    motions = {name: Motion(reason="reference" if i == 0 else NOT_LOOKED_FOR) for i, name in enumerate(names)}
     if options.scope == "all":
         finished, turn = itertools.count(1), threading.Lock()
+        anchor = anchored(grey[0], mask)
 
         def between_lights(i: int) -> dict[str, Any]:
-            found = across(grey[0], grey[i + 1], mask, options)
+            found = between(anchor, grey[i + 1], options)
             with turn:
                 progress("alignment", next(finished), len(names) - 1)
             return found.plain()
@@ -172,8 +189,6 @@ def align(
         at_once = torch.get_num_threads() if mask.numel() <= SIDE_BY_SIDE_PX else 1
         found = by_items(len(names) - 1, between_lights, at_once=at_once)
         motions |= {name: Motion.from_plain(values) for name, values in zip(names[1:], found, strict=True)}
-        checked = checked_among_lights([motions[name] for name in names], grey, good, mask, _vectors(capture, names))
-        motions = dict(zip(names, checked, strict=True))
 
     def same_light(i: int) -> tuple[dict[str, Any], list[dict[str, Any]], list[str]]:
         sweep = capture.sweeps[i]
@@ -205,13 +220,6 @@ def align(
     )
 
 
-def _vectors(capture: Capture, names: Sequence[str]) -> Tensor | None:
-    """Light vectors; None where one is not known."""
-    vectors = [light_vector(capture.lights[name]) for name in names]
-    known = [vector for vector in vectors if vector is not None]
-    return torch.tensor(known, dtype=torch.float64) if len(known) == len(vectors) else None
-
-
 def _same_light(
     full: Tensor, good: Tensor, mask: Tensor, place: Motion, added: SweepSum, options: AlignOptions
 ) -> Motion:
@@ -223,7 +231,7 @@ def _same_light(
     try:
         found = register(
             added.total,
-            full[None],
+            full,
             usable=usable,
             moving_usable=added.usable,
             time=added.time,

@@ -52,7 +52,7 @@ def _motion(first: FrameStream, other: FrameStream, mask: Tensor, options: Align
     try:
         found = register(
             moving,
-            still[None],
+            still,
             usable=grown(mask, MARGIN_PX) & seen,
             moving_usable=seen,
             options=RegisterOptions(models=options.models),

@@ -28,7 +28,8 @@ def exceeds(
     values, covariance = further @ values, further @ covariance @ further.mT
     wald = float(values @ torch.linalg.solve(covariance, values))
     k = len(further)
-    if options.lenient_turn and simple[0] == "translation" and rich[0] == "rigid" and simple[1] == rich[1]:
+    # A camera that was touched turns too: a rotation is taken where it predicts best (Akaike), not beyond chance alone.
+    if simple[0] == "translation" and rich[0] == "rigid" and simple[1] == rich[1]:
         return wald > 2.0 * k
     return wald > k + 2 * (k * options.evidence) ** 0.5 + 2 * options.evidence
 
@@ -38,8 +39,7 @@ def _parameters(
 ) -> tuple[Tensor, Tensor]:
     """The motion as parameters in pixels at the picture's rim, with their covariance."""
     assert state.covariance is not None
-    count = len(state.coefficients)
-    covariance = state.covariance[:-count, :-count]
+    covariance = state.covariance[:-2, :-2]
     floor = (options.floor_px / level.factor) ** 2
     covariance = covariance + floor * torch.eye(len(covariance), dtype=torch.float64)
     centre, scale = frame_of(level)

@@ -1,7 +1,7 @@
 """Pictures that a fit never saw, as it would have seen them: developed alike, and in the first basis picture's place.
 
 A camera that drifted between the other lights drifted before a held-out one too, and a picture that lies elsewhere is
-unlike any relit one. Its motion is found as that of any picture under another light (`across_lights`), from measured
+unlike any relit one. Its motion is found as that of any picture under another light (`between_lights`), from measured
 pictures alone: by what is relit, the comparison would be made to agree with the model that it judges.
 """
 
@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from reflectsep.calibrate.across_lights import across
 from reflectsep.calibrate.align_options import AlignOptions
+from reflectsep.calibrate.between_lights import Anchor, anchored, between
 from reflectsep.calibrate.exposure import response_of
 from reflectsep.calibrate.motion import Motion, warp
 from reflectsep.calibrate.stack import check_names, develop_pictures
@@ -41,8 +41,8 @@ class HeldOutPictures:
 class Still:
     """What held-out pictures are registered against."""
 
-    grey: Float[Tensor, "height width"]
-    mask: Bool[Tensor, "height width"]
+    anchor: Anchor
+    """The first basis light's full picture, prepared."""
     options: AlignOptions | None
     """None, or with the scope `same_light`: pictures stay as they lie."""
     region: Region | None = None
@@ -56,9 +56,9 @@ class Still:
         return kept(self.region, values), kept(self.region, clipped), motion
 
     def _placed(self, picture: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Motion]:
-        if self.options is None or self.options.scope != "all" or picture.shape[1:] != self.grey.shape:
+        if self.options is None or self.options.scope != "all" or picture.shape[1:] != self.anchor.mask.shape:
             return picture, bad, Motion(reason="not looked for")
-        motion = across(self.grey, torch.where(bad, 0.0, picture).mean(0).double(), self.mask, self.options)
+        motion = between(self.anchor, torch.where(bad, 0.0, picture).mean(0).double(), self.options)
         if not motion.applied:
             return picture, bad, motion
         values, clipped, seen = warp(picture, motion.matrix, bad)
@@ -73,7 +73,7 @@ def still_of(capture: Capture, options: AlignOptions | None) -> Still:
     """
     region, capture = capture.region, replace(capture, region=None)
     _, pictures, _ = _developed(capture, [])
-    return Still(grey=pictures[0].mean(0).double(), mask=read_mask(capture), options=options, region=region)
+    return Still(anchor=anchored(pictures[0].mean(0).double(), read_mask(capture)), options=options, region=region)
 
 
 def kept(region: Region | None, picture: Tensor) -> Tensor:
@@ -99,7 +99,7 @@ def held_out_pictures(capture: Capture, names: Sequence[str], options: AlignOpti
     # Registered whole: a part may show too little of the object, or none of its edges.
     region, capture = capture.region, replace(capture, region=None)
     found, pictures, bad = _developed(capture, names)
-    still = Still(grey=pictures[0].mean(0).double(), mask=read_mask(capture), options=options)
+    still = Still(anchor=anchored(pictures[0].mean(0).double(), read_mask(capture)), options=options)
     placed = [still.place(pictures[i], bad[i]) for i in (found.index(name) for name in names)]
     return HeldOutPictures(
         names=tuple(names),

@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.transform import remap
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 Model = Literal["identity", "translation", "rigid", "affine", "homography"]
 MODELS: tuple[Model, ...] = ("identity", "translation", "rigid", "affine", "homography")
@@ -151,7 +151,7 @@ def sample(
     places: Float[Tensor, "2 height width"],
     mode: Literal["bilinear", "bicubic", "nearest"] = "bicubic",
 ) -> Float[Tensor, "channels height width"]:
-    """The picture at fractional places (column, row); its edge is drawn on outwards. One resampling (kornia).
+    """The picture at fractional places (column, row); its edge is drawn on outwards.
 
     Torch's cubic has a = -0.75, which does not even keep a ramp in its place (0.05 px at a quarter of a pixel). The
     family is linear in a, and a = 0 is bilinear interpolation at f^2 (3 - 2 f) in place of the fraction f: two thirds
@@ -166,9 +166,10 @@ def sample(
 
 
 def _remap(picture: Tensor, places: Tensor, mode: str) -> Tensor:
-    x, y = (axis.to(picture.dtype)[None] for axis in places)
-    # The channels as one picture, so that there is one grid for all of them.
-    return remap(picture[None], x, y, mode=mode, padding_mode="border", align_corners=True)[0]
+    # One grid for all channels, in torch's coordinates: -1 and 1 are the middles of the outermost pixels.
+    size = places.new_tensor(picture.shape[:0:-1]).sub(1).clamp_min(1)
+    grid = (places * (2.0 / size)[:, None, None] - 1.0).permute(1, 2, 0).to(picture.dtype)
+    return grid_sample(picture[None], grid[None], mode=mode, padding_mode="border", align_corners=True)[0]
 
 
 def inside(places: Float[Tensor, "2 height width"]) -> Bool[Tensor, "height width"]:

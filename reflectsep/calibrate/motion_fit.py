@@ -1,4 +1,4 @@
-"""One motion model at one scale: Gauss-Newton on the motion and the mix of templates together, robustly.
+"""One motion model at one scale: Gauss-Newton on the motion, the gain and the offset together, robustly.
 
 The gradient is the mean of both sides', which converges in a handful of steps; Tukey's biweight is let down from the
 first residual to the noise. The moving picture is always resampled from the original.
@@ -18,6 +18,8 @@ from reflectsep.calibrate.tiles import tile_index
 
 TUKEY = 4.685
 FEWEST_PIXELS = 64
+SETTLED_PX = 5e-4
+"""A step this small, pixels at the rim, is the last."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,10 +28,9 @@ class MotionState:
 
     matrix: Tensor
     velocity: Tensor
-    coefficients: Tensor
+    mix: Tensor
+    """Gain and offset."""
     sigma: float
-    cost: Tensor
-    """Per pixel, Tukey's rho in units of sigma^2, 0 where there is no weight."""
     weights: Tensor
     covariance: Tensor | None = None
 
@@ -38,19 +39,22 @@ def residual_of(level: Level, state: MotionState) -> tuple[Tensor, Tensor, Tenso
     """Moving - mix, the moved picture, and where both are measured."""
     height, width = level.moving.shape
     places = positions(state.matrix, height, width, state.velocity[:, None, None] * level.time)
-    both = sample(torch.stack([level.moving, level.moving_bad]), places, "bicubic")
-    valid = inside(places) & (both[1] < 0.5) & (level.weight > 0)
-    mix = torch.einsum("i,ihw->hw", state.coefficients[:-1], level.templates) + state.coefficients[-1]
-    return both[0] - mix, both[0], valid
+    valid = inside(places) & (level.weight > 0)
+    if level.moving_bad is None:
+        moved = sample(level.moving[None], places)[0]
+    else:
+        moved, bad = sample(torch.stack([level.moving, level.moving_bad]), places)
+        valid &= bad < 0.5
+    return moved - state.mix[0] * level.template - state.mix[1], moved, valid
 
 
 def _fit_mix(level: Level, moved: Tensor, weights: Tensor) -> Tensor:
-    """Weighted least squares for the coefficients and the constant."""
-    columns = torch.cat([level.templates, torch.ones_like(moved)[None]]).flatten(1).mT
-    w = weights.flatten()[:, None]
-    gram = columns.mT @ (w * columns)
+    """Weighted least squares for gain and offset."""
+    columns = torch.stack([level.template, torch.ones_like(moved)]).flatten(1)
+    weighed = weights.flatten() * columns
+    gram = weighed @ columns.mT
     ridge = 1e-10 * torch.diag(gram.diagonal().clamp_min(1e-300))
-    return torch.linalg.solve(gram + ridge, columns.mT @ (w * moved.flatten()[:, None]))[:, 0]
+    return torch.linalg.solve(gram + ridge, weighed @ moved.flatten())
 
 
 def solve_motion(
@@ -63,21 +67,19 @@ def solve_motion(
     begin: MotionState | None = None,
 ) -> MotionState:
     """Gauss-Newton for one model at one level; from `begin` with its scale held, where given."""
-    count = len(level.templates) + 1
     state = MotionState(
         matrix=start.clone(),
         velocity=torch.zeros(2, dtype=torch.float64) if begin is None else begin.velocity,
-        coefficients=torch.zeros(count, dtype=torch.float64),
+        mix=torch.zeros(2, dtype=torch.float64),
         sigma=float("inf"),
-        cost=torch.zeros_like(level.moving),
         weights=level.weight,
     )
-    _, moved, valid = residual_of(level, state)
+    residual, moved, valid = residual_of(level, state)
     floor = options.noise_floor * float(_bright(level))
-    state = replace(state, coefficients=_fit_mix(level, moved, level.weight * valid))
+    state = replace(state, mix=_fit_mix(level, moved, level.weight * valid))
     sigma = None if begin is None else begin.sigma
     for i in range(options.iterations):
-        residual, moved, valid = residual_of(level, state)
+        residual = moved - state.mix[0] * level.template - state.mix[1]
         if int(valid.sum()) < FEWEST_PIXELS // 4:
             return state
         robust = max(MAD_TO_SIGMA * float(residual[valid].abs().median()), floor)
@@ -85,21 +87,24 @@ def solve_motion(
             rms = float(residual[valid].square().mean().sqrt())
             sigma = max(rms, robust) if sigma is None else max(robust, 0.7 * sigma)
         assert sigma is not None
-        weights = (1.0 - (residual / (TUKEY * sigma)).square()).clamp_min(0).square() * valid * level.weight
-        state = replace(state, sigma=sigma, weights=weights)
+        state = replace(state, sigma=sigma, weights=_tukey(residual, sigma) * valid * level.weight)
         columns = _columns(level, state, moved, model, drifting)
-        system = _normal_equations(columns, residual, weights)
+        system = _normal_equations(columns, residual, state.weights)
         step = -torch.linalg.solve(system.gram, system.gradient) / system.scale
         state = _moved(state, step, model, drifting, level)
-        motion = step[: len(step) - count]
-        settled = (motion.numel() == 0 or float(motion.abs().max()) < 1e-4) and sigma <= 1.01 * robust
+        motion = step[:-2]
+        settled = (motion.numel() == 0 or float(motion.abs().max()) < SETTLED_PX) and sigma <= 1.01 * robust
         if settled or i == options.iterations - 1:
-            state = replace(state, covariance=_covariance(system, residual, weights, level, options))
+            state = replace(state, covariance=_covariance(system, residual, state.weights, level, options))
             break
+        if motion.numel():  # a picture that lies still is sampled once
+            _, moved, valid = residual_of(level, state)
     residual, _, valid = residual_of(level, state)
-    unit = (residual / (TUKEY * state.sigma)).square()
-    weights = (1.0 - unit).clamp_min(0).square() * valid * level.weight
-    return replace(state, weights=weights)
+    return replace(state, weights=_tukey(residual, state.sigma) * valid * level.weight)
+
+
+def _tukey(residual: Tensor, sigma: float) -> Tensor:
+    return (1.0 - (residual / (TUKEY * sigma)).square()).clamp_min(0).square()
 
 
 def _bright(level: Level) -> Tensor:
@@ -108,14 +113,12 @@ def _bright(level: Level) -> Tensor:
 
 
 def _columns(level: Level, state: MotionState, moved: Tensor, model: Model, drifting: bool) -> Tensor:
-    """Derivatives of the residual by the motion (pixels at the object's rim) and by the mix: (pixels, unknowns)."""
-    slope = slopes_of(moved[None], level.slope_blur_px)[0]
-    mixed = torch.einsum("i,idhw->dhw", state.coefficients[:-1], level.slopes)
-    gx, gy = 0.5 * (slope + mixed)
+    """Derivatives of the residual by the motion (pixels at the object's rim) and by the mix: (unknowns, pixels)."""
+    if model == "identity":
+        return torch.stack([-level.template, -torch.ones_like(moved)]).flatten(1)
+    gx, gy = 0.5 * (slopes_of(moved[None], level.slope_blur_px)[0] + state.mix[0] * level.slopes)
     x, y, _ = centred(level)
-    parts: list[Tensor] = []
-    if model != "identity":
-        parts += [gx, gy]
+    parts = [gx, gy]
     if model == "rigid":
         parts += [-gx * y + gy * x]
     if model in ("affine", "homography"):
@@ -125,8 +128,7 @@ def _columns(level: Level, state: MotionState, moved: Tensor, model: Model, drif
         parts += [-radial * x, -radial * y]
     if drifting:
         parts += [gx * level.time, gy * level.time]
-    mix = [*(-template for template in level.templates), -torch.ones_like(moved)]
-    return torch.stack([*parts, *mix]).flatten(1).mT
+    return torch.stack([*parts, -level.template, -torch.ones_like(moved)]).flatten(1)
 
 
 def centred(level: Level) -> tuple[Tensor, Tensor, float]:
@@ -144,20 +146,16 @@ class _System:
     gram: Tensor
     gradient: Tensor
     scale: Tensor
-    columns: Tensor
-    force: Tensor
-    """Of every pixel, its derivatives and its weighted residual: the gradient is their product."""
+    weighed: Tensor
+    """Derivatives times weights (unknowns, pixels)."""
 
 
 def _normal_equations(columns: Tensor, residual: Tensor, weights: Tensor) -> _System:
-    """Those of the pixels that count."""
-    counts = weights.flatten() > 0
-    columns, w, error = columns[counts], weights.flatten()[counts], residual.flatten()[counts]
-    scale = (columns.square() * w[:, None]).sum(0).sqrt().clamp_min(1e-30)
-    unit = columns / scale
-    gram = unit.mT @ (w[:, None] * unit)
-    gram = gram + 1e-9 * torch.eye(gram.shape[0], dtype=gram.dtype)
-    return _System(gram, unit.mT @ (w * error), scale, unit, w * error)
+    weighed = columns * weights.flatten()
+    gram = weighed @ columns.mT
+    scale = gram.diagonal().sqrt().clamp_min(1e-30)
+    gram = gram / scale[:, None] / scale + 1e-9 * torch.eye(gram.shape[0], dtype=gram.dtype)
+    return _System(gram, weighed @ residual.flatten() / scale, scale, weighed)
 
 
 def _covariance(system: _System, residual: Tensor, weights: Tensor, level: Level, options: RegisterOptions) -> Tensor:
@@ -165,9 +163,9 @@ def _covariance(system: _System, residual: Tensor, weights: Tensor, level: Level
     inverse = torch.linalg.inv(system.gram)
     density = max(_noise_density(residual, weights, options), 1e-30)
     plain = inverse * density
-    tile = tile_index(level.weight, options.tiles).flatten()[weights.flatten() > 0]
+    tile = tile_index(level.weight, options.tiles).flatten()
     sums = torch.zeros(options.tiles**2, len(plain), dtype=plain.dtype)
-    sums.index_add_(0, tile, system.force[:, None] * system.columns)
+    sums.index_add_(0, tile, (system.weighed * residual.flatten() / system.scale[:, None]).mT)
     tiled = inverse @ (sums.mT @ sums) @ inverse
     # Tiles see what noise alone does not say, but a few that hold most of the outline are too few draws by themselves.
     excess = float((system.gram @ tiled).trace()) / density / len(plain)
@@ -183,8 +181,7 @@ def _noise_density(residual: Tensor, weights: Tensor, options: RegisterOptions) 
 
 def _moved(state: MotionState, step: Tensor, model: Model, drifting: bool, level: Level) -> MotionState:
     """The state after a step; the motion's part is composed before the matrix (x -> S (x + step))."""
-    count = len(state.coefficients)
-    motion, mix = step[: len(step) - count], step[len(step) - count :]
+    motion, mix = step[:-2], step[-2:]
     velocity = state.velocity
     if drifting:
         velocity = velocity + motion[-2:].clamp(-2.0, 2.0)
@@ -195,7 +192,7 @@ def _moved(state: MotionState, step: Tensor, model: Model, drifting: bool, level
         motion = motion * min(1.0, 2.0 / max(longest, 1e-30))  # a linearisation holds for a pixel or two
         matrix = matrix @ _increment(motion, model, level)
         matrix = matrix / matrix[2, 2]
-    return replace(state, matrix=matrix, velocity=velocity, coefficients=state.coefficients + mix)
+    return replace(state, matrix=matrix, velocity=velocity, mix=state.mix + mix)
 
 
 def frame_of(level: Level) -> tuple[Tensor, float]:

@@ -23,10 +23,11 @@ class Level:
     """Both sides at one scale."""
 
     moving: Float[Tensor, "height width"]
-    moving_bad: Float[Tensor, "height width"]
-    templates: Float[Tensor, "templates height width"]
+    moving_bad: Float[Tensor, "height width"] | None
+    """1 next to values that are clipped or not finite; None where there are none."""
+    template: Float[Tensor, "height width"]
     weight: Float[Tensor, "height width"]
-    slopes: Float[Tensor, "templates 2 height width"]
+    slopes: Float[Tensor, "2 height width"]
     slope_blur_px: float
     """Further blur of pictures that slopes are taken from."""
     time: Float[Tensor, "height width"]
@@ -52,10 +53,10 @@ def _shrink(factor: int) -> Tensor:
 
 
 def pyramid_of(
-    moving: Tensor, moving_usable: Tensor, templates: Tensor, usable: Tensor, time: Tensor, options: RegisterOptions
+    moving: Tensor, moving_usable: Tensor, template: Tensor, usable: Tensor, time: Tensor, options: RegisterOptions
 ) -> list[Level]:
     """Coarsest first."""
-    pictures = torch.cat([moving[None], templates]).double()
+    pictures = torch.stack([moving, template]).double()
     pictures = torch.where(torch.isfinite(pictures), pictures, 0.0)
     bad, weight, time = (~moving_usable).double(), usable.double(), time.double()
     factor, levels = 1, []
@@ -80,10 +81,10 @@ def _level(pictures: Tensor, bad: Tensor, weight: Tensor, time: Tensor, factor: 
     holes = max_pool2d((weight == 0).double()[None, None], 3, stride=1, padding=1)[0, 0]
     return Level(
         moving=smooth[0],
-        moving_bad=grown,
-        templates=smooth[1:],
+        moving_bad=grown if bool((bad > 0).any()) else None,
+        template=smooth[1],
         weight=torch.where(holes > 0, 0.0, weight),
-        slopes=slopes_of(smooth[1:], slope_blur_px),
+        slopes=slopes_of(smooth[1:], slope_blur_px)[0],
         slope_blur_px=slope_blur_px,
         time=time,
         factor=factor,

@@ -1,11 +1,10 @@
 """Registration of pictures that show the same thing: robust, photometric, coarse to fine, model chosen by evidence.
 
-    moving(sample_p(x)) = sum_i c_i template_i(x) + b          for most pixels x
+    moving(sample_p(x)) = c template(x) + b          for most pixels x
 
-c and b are free, so that an unknown exposure ratio (C of Eq. 25) does no harm; with several templates the moving
-picture may be any mix of them (Eq. 15). Gauss-Newton on p, c and b together, Tukey's biweight whose scale is let down
-from the first residual to the noise; the gradient is the mean of both sides', which converges in a handful of steps.
-The moving picture is always resampled from the original.
+c and b are free, so that an unknown exposure ratio (C of Eq. 25) does no harm. Gauss-Newton on p, c and b together,
+Tukey's biweight whose scale is let down from the first residual to the noise; the gradient is the mean of both sides',
+which converges in a handful of steps. The moving picture is always resampled from the original.
 
 Evidence: of the nested models (none, translation, rigid, affine, homography) a richer one is taken where its further
 parameters differ from nothing beyond chance (Wald; a covariance with the tiles of the picture as independent draws,
@@ -24,7 +23,7 @@ from torch import Tensor
 
 from reflectsep.calibrate.evidence import exceeds, on_unseen, sd_px_of
 from reflectsep.calibrate.motion import Model, displacement
-from reflectsep.calibrate.motion_fit import FEWEST_PIXELS, solve_motion
+from reflectsep.calibrate.motion_fit import FEWEST_PIXELS, MotionState, solve_motion
 from reflectsep.calibrate.pyramid import Level, from_level, pyramid_of, to_level
 from reflectsep.calibrate.register_options import RegisterOptions
 from reflectsep.errors import CaptureError
@@ -40,7 +39,7 @@ class Registration:
     displacement_px: float
     sd_px: float
     trust: float
-    coefficients: Float[Tensor, "templates"]
+    gain: float
     residual: float
     """Robust standard deviation after it, in the pictures' units."""
     gain_in_agreement: float
@@ -51,24 +50,22 @@ class Registration:
 
 def register(
     moving: Float[Tensor, "height width"],
-    templates: Float[Tensor, "templates height width"],
+    template: Float[Tensor, "height width"],
     *,
     usable: Bool[Tensor, "height width"],
     moving_usable: Bool[Tensor, "height width"] | None = None,
     time: Float[Tensor, "height width"] | None = None,
     options: RegisterOptions | None = None,
-    start: Float[Tensor, "3 3"] | None = None,
 ) -> Registration:
-    """Find the motion of `moving` against `templates`.
+    """Find the motion of `moving` against `template`.
 
     Args:
         moving: the picture that may have moved.
-        templates: pictures in the reference's place; the moving one is a mix of them and a constant.
-        usable: reference pixels that count: on the object and a margin around it, not clipped in a template.
+        template: the picture in the reference's place; the moving one is its multiple and a constant.
+        usable: reference pixels that count: on the object and a margin around it, not clipped in the template.
         moving_usable: pixels of the moving picture that are not clipped and finite.
         time: -1 to 1, when a sweep's light reached each pixel; needed for `options.drift`.
         options: settings.
-        start: first guess of the matrix.
 
     Returns:
         The motion; identity where no model predicts unseen pixels better.
@@ -82,10 +79,9 @@ def register(
         raise CaptureError(f"{count} pixels can be compared, expected at least {FEWEST_PIXELS}")
     moving_usable = torch.ones_like(usable) if moving_usable is None else moving_usable
     time = torch.zeros(usable.shape) if time is None else time
-    pyramid = pyramid_of(moving, moving_usable, templates, usable, time, options)
+    pyramid = pyramid_of(moving, moving_usable, template, usable, time, options)
     finest = pyramid[-1]
-    matrix = torch.eye(3, dtype=torch.float64) if start is None else to_level(start.double(), finest.factor)
-    matrix = _coarse(pyramid, matrix, options)
+    matrix = _coarse(pyramid, options)
     cameras: list[Model] = [model for model in options.models if model not in ("affine", "homography")]
     candidates: list[tuple[Model, bool]] = [(model, False) for model in cameras]
     if options.drift:
@@ -95,11 +91,14 @@ def register(
     return _choose(finest, matrix, candidates, usable, options)
 
 
-def _coarse(pyramid: Sequence[Level], matrix: Tensor, options: RegisterOptions) -> Tensor:
-    """Translation, then a rigid motion, from the coarsest level to the finest; in the finest's coordinates."""
+def _coarse(pyramid: Sequence[Level], options: RegisterOptions) -> Tensor:
+    """Translation, then a rigid motion, from the coarsest level to the finest but one; in the finest's coordinates.
+
+    At the finest level every model is fitted for itself.
+    """
     finest = pyramid[-1]
-    best = matrix
-    for level in pyramid:
+    best = torch.eye(3, dtype=torch.float64)
+    for level in pyramid[:-1] or pyramid:
         ratio = level.factor // finest.factor
         local = to_level(best, ratio)
         for model in ("translation", "rigid"):
@@ -113,12 +112,14 @@ def _coarse(pyramid: Sequence[Level], matrix: Tensor, options: RegisterOptions) 
 def _choose(
     level: Level, start: Tensor, candidates: Sequence[tuple[Model, bool]], usable: Tensor, options: RegisterOptions
 ) -> Registration:
-    fits = {}
-    for model, drifting in candidates:
-        fits[model, drifting] = solve_motion(level, model, _restricted(start, model, level), options, drifting=drifting)
+    fits: dict[tuple[Model, bool], MotionState] = {}
     chosen = candidates[0]
-    for candidate in candidates[1:]:
-        if exceeds(fits[candidate], chosen, candidate, level, options):
+    for candidate in candidates:
+        model, drifting = candidate
+        if model == "homography" and chosen[0] != "affine":
+            continue  # a camera that tilts by enough to converge shears as well
+        fits[candidate] = solve_motion(level, model, _restricted(start, model, level), options, drifting=drifting)
+        if candidate != candidates[0] and exceeds(fits[candidate], chosen, candidate, level, options):
             chosen = candidate
     fall, significance = 0.0, 0.0
     if chosen != candidates[0]:
@@ -135,7 +136,7 @@ def _choose(
         displacement_px=displacement(matrix, usable),
         sd_px=sd_px_of(level, state, chosen, options) * level.factor,
         trust=float(state.weights[weighed].mean()),
-        coefficients=state.coefficients,
+        gain=float(state.mix[0]),
         residual=state.sigma,
         gain_in_agreement=fall,
         significance=significance,

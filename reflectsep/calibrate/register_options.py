@@ -25,12 +25,9 @@ class RegisterOptions:
     """Standard errors by which a motion must predict better what it was not fitted to."""
     floor_px: float = 0.01
     """Systematic error of a motion (interpolation) that is always allowed for."""
-    most_pixels: int = 500_000
+    most_pixels: int = 150_000
     """Larger pictures are halved until they are no larger; a twentieth of a pixel is seen there too."""
     noise_floor: float = 1e-3
     """Least residual, as a share of the picture's bright end, that is told from agreement."""
-    lenient_turn: bool = True
-    """Whether a rotation is taken where it predicts best (Akaike) rather than where it is beyond chance: right for a
-    camera that was touched, and pictures of the same light."""
     drift: bool = False
     """Whether slow drift along `time` may be found besides."""

@@ -80,6 +80,7 @@ def lead(facts: Facts) -> str:
         row.append(Panel(title="local diffuse", picture=separation.local_diffuse[0], white=white))
         row.append(Panel(title="scattering", picture=separation.scattering[0], white=white))
     kept = extensions(separation)
+    told = str(document.get("alignment", {}).get("told", ""))
     rms = float(document.get("residual", {}).get("rms", float("nan")))
     peak = float(whole[:, :, separation.mask].max())
     height, width = separation.mask.shape
@@ -100,6 +101,7 @@ def lead(facts: Facts) -> str:
                 ["misfit", f"{rms:.3g} rms in the capture's units, {100 * rms / peak:.2g} % of the brightest value"],
                 ["gloss n_s", f"{float(separation.n_s):.2f}"],
                 ["n_d", f"{float(separation.n_d):.4f} ({document.get('n_d_source', 'unknown')})"],
+                *([["motion", told]] if told else []),
                 *([["beyond the paper", kept]] if kept else []),
                 ["made", str(document.get("created", ""))],
             ],

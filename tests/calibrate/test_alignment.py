@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.nn.functional import avg_pool2d
 
-from reflectsep.calibrate import across_lights, alignment
+from reflectsep.calibrate import alignment
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.aligned_stream import aligned_stream
 from reflectsep.calibrate.alignment import Alignment, align, covered
@@ -86,26 +85,6 @@ def test_pictures_side_by_side_are_those_one_after_the_other(drifted, monkeypatc
     lights = [entry for entry in told if entry[0] == "alignment"]
     assert lights == [("alignment", i + 1, len(drifted.names) - 1) for i in range(len(drifted.names) - 1)]
     assert {name: m.plain() for name, m in together.items()} == {name: m.plain() for name, m in apart.items()}
-
-
-@pytest.mark.parametrize("factor", [1, 2])
-def test_large_pictures_under_other_lights_are_compared_by_their_means(drifted, found, monkeypatch, factor):
-    raw, mask = read_full(drifted), read_mask(drifted)
-    pictures, _ = develop_pictures(drifted, raw, response_of(drifted))
-    grey = pictures.mean(1).double()
-    monkeypatch.setattr(across_lights, "LARGEST_PICTURE", mask.numel() // factor**2)
-    motion = across_lights.across(grey[0], grey[1], mask)
-    if factor == 1:
-        assert torch.equal(motion.matrix, found.pictures[drifted.names[1]].matrix)
-    true = truth(drifted, f"full/{drifted.names[1]}").matrix
-    assert displacement(true, mask) > 1.0
-    error = displacement(true @ torch.linalg.inv(motion.matrix), mask)
-    assert error < 0.2 * factor
-    assert error < 4 * motion.sd_px
-    assert motion.displacement_px == pytest.approx(displacement(motion.matrix, mask), rel=0.02)
-    if factor == 2:
-        small = across_lights.across(*avg_pool2d(grey[:2], 2), avg_pool2d(mask[None].float(), 2)[0] > 0.5)
-        assert motion.sd_px == 2.0 * small.sd_px
 
 
 def test_a_sweep_is_moved_once_by_both_its_motions(drifted, found):
@@ -197,6 +176,18 @@ def test_document_names_the_reference_and_every_motion(drifted, found):
     assert list(document["pictures"]) == list(drifted.names)
     assert [(s["light"], s["direction"]) for s in document["sweeps"]] == [("L1", "x"), ("L2", "x"), ("L3", "x")]
     assert json.loads(json.dumps(document)) == document
+
+
+def test_what_was_moved_is_told_and_what_was_not_found_too(drifted, found, still):
+    told = found.told(drifted)
+    for name in drifted.names[1:]:
+        assert f"{name} by {found.pictures[name].displacement_px:.2f} px" in told
+    assert f"L2 along x by {found.against_full[1].displacement_px:.2f} px" in told
+    assert "L1 by" not in told
+    assert aligned(still).told(still) == "no motion between lights proven; no sweep moved"
+    same = aligned(still, AlignOptions(scope="same_light")).told(still)
+    assert same == "motion between lights not looked for; no sweep moved"
+    assert found.document(drifted)["told"] == told
 
 
 def test_motions_of_a_window_are_those_of_the_whole(found):

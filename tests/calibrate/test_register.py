@@ -50,12 +50,12 @@ def test_rigid_motions_are_found_within_a_twentieth_of_a_pixel(still, pixels, de
     true = shifted(pixels * math.cos(way), pixels * math.sin(way), degrees, centre(still))
     # The moving picture is a sum of frames: noisier, and C = 2 times as bright.
     moving = 2.0 * noisy(moved(still[None], true)[0], 1, 0.02)
-    found = register(moving, noisy(still, 2)[None], usable=everywhere(still))
+    found = register(moving, noisy(still, 2), usable=everywhere(still))
     assert found.model == "rigid"
     assert displacement(true @ torch.linalg.inv(found.matrix), everywhere(still)) < 0.05
     turn = math.degrees(math.atan2(float(found.matrix[1, 0]), float(found.matrix[0, 0])))
     assert turn == pytest.approx(degrees, abs=0.03)
-    assert float(found.coefficients[0]) == pytest.approx(2.0, rel=0.01)
+    assert found.gain == pytest.approx(2.0, rel=0.01)
     assert found.sd_px < 0.05
 
 
@@ -63,7 +63,7 @@ def test_rigid_motions_are_found_within_a_twentieth_of_a_pixel(still, pixels, de
 @given(st.integers(0, 10_000))
 def test_no_motion_is_found_where_there_is_none(seed):
     still = scene(64)
-    found = register(noisy(still, seed), noisy(still, seed + 1)[None], usable=everywhere(still))
+    found = register(noisy(still, seed), noisy(still, seed + 1), usable=everywhere(still))
     assert found.model == "identity"
     assert torch.equal(found.matrix, torch.eye(3, dtype=torch.float64))
 
@@ -75,7 +75,7 @@ def test_uncertainty_is_that_of_repeated_draws():
     errors, stated = [], []
     for seed in range(20):
         moving = noisy(moved(still[None], true)[0], 2 * seed, 0.03)
-        found = register(moving, noisy(still, 2 * seed + 1, 0.03)[None], usable=everywhere(still), options=only)
+        found = register(moving, noisy(still, 2 * seed + 1, 0.03), usable=everywhere(still), options=only)
         errors.append((found.matrix[:2, 2] - true[:2, 2]).square().sum())
         stated.append(found.sd_px)
     actual = float(torch.stack(errors).mean().sqrt())
@@ -84,7 +84,7 @@ def test_uncertainty_is_that_of_repeated_draws():
 
 def test_affine_motion_is_told_from_a_rigid_one(still):
     true = torch.tensor([[1.012, 0.0, -0.7], [0.0, 0.996, 0.3], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    found = register(noisy(moved(still[None], true)[0], 1), noisy(still, 2)[None], usable=everywhere(still))
+    found = register(noisy(moved(still[None], true)[0], 1), noisy(still, 2), usable=everywhere(still))
     assert found.model == "affine"
     assert displacement(true @ torch.linalg.inv(found.matrix), everywhere(still)) < 0.05
 
@@ -96,7 +96,7 @@ def test_drift_along_a_passage_is_found(still):
     moving = torch.stack([picture[:, i] for i, picture in enumerate(slices)], 1)
     found = register(
         noisy(moving, 1),
-        noisy(still, 2)[None],
+        noisy(still, 2),
         usable=everywhere(still),
         time=time,
         options=RegisterOptions(drift=True),
@@ -109,24 +109,14 @@ def test_outliers_do_not_pull(still):
     true = shifted(1.2, 0.7)
     moving = noisy(moved(still[None], true)[0], 1)
     moving[30:60, 30:60] += 0.8  # a highlight that the other picture has not
-    found = register(moving, noisy(still, 2)[None], usable=everywhere(still))
+    found = register(moving, noisy(still, 2), usable=everywhere(still))
     assert displacement(true @ torch.linalg.inv(found.matrix), everywhere(still)) < 0.05
 
 
 def test_clipped_values_do_not_count(still):
     true = shifted(1.2, 0.7)
     moving = moved(still[None], true)[0].clamp(max=0.6)
-    found = register(noisy(moving, 1), noisy(still, 2)[None], usable=still < 0.6, moving_usable=moving < 0.6)
-    assert displacement(true @ torch.linalg.inv(found.matrix), everywhere(still)) < 0.05
-
-
-def test_a_mix_of_templates_is_registered():
-    still = scene(96)
-    ramp = torch.linspace(0, 1, 96).double()[None].expand(96, 96) * still
-    true = shifted(-0.7, 1.4)
-    moving = noisy(moved((0.3 * still + 0.9 * ramp)[None], true)[0], 1)
-    found = register(moving, torch.stack([still, ramp]), usable=everywhere(still))
-    assert found.coefficients[:2].tolist() == pytest.approx([0.3, 0.9], abs=0.03)
+    found = register(noisy(moving, 1), noisy(still, 2), usable=still < 0.6, moving_usable=moving < 0.6)
     assert displacement(true @ torch.linalg.inv(found.matrix), everywhere(still)) < 0.05
 
 
@@ -134,4 +124,4 @@ def test_too_few_pixels_are_refused(still):
     few = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     few[:5, :5] = True
     with pytest.raises(CaptureError, match="25 pixels can be compared, expected at least 64"):
-        register(still, still[None], usable=few)
+        register(still, still, usable=few)

@@ -23,7 +23,7 @@ from reflectsep.report.figures import HeldOut
 from reflectsep.report.quality import flag_shares, reproduce
 from reflectsep.report.sweeps import view_sweep
 from reflectsep.report.valley import cost_valley
-from reflectsep.report.writer import Facts, write_report
+from reflectsep.report.writer import Facts, lead, write_report
 
 SIZE = 24
 
@@ -114,6 +114,15 @@ def test_a_report_without_capture_says_what_is_missing(exact, tmp_path):
     assert "No picture was held out" in text
     assert text.count("data:image/png;base64,") >= 5
     assert "NaN" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_what_was_moved_is_said_among_the_first_things(exact):
+    separation, stack = exact
+    told = "moved between lights: L3 by 1.52 px; no sweep moved"
+    document = {**separation.document, "alignment": {"pictures": {}, "sweeps": [], "told": told}}
+    facts = Facts(name="n", separation=separation, stack=stack, command="reflectsep fit n")
+    assert told not in lead(facts)
+    assert told in lead(dataclasses.replace(facts, separation=dataclasses.replace(separation, document=document)))
 
 
 def test_names_and_warnings_are_no_markup(exact, tmp_path):
