@@ -31,6 +31,8 @@ from reflectsep.scatter.spread import Slab, Spreading
 
 HIDDEN_ERROR, SHOWN_ERROR = 0.12, 0.01
 """Relative standard deviations of what no frame shows, and of the rest (`scripts/scattering_spectrum.py`)."""
+LEAST_NOISE = 1e-4
+"""Of a frame, relative to the full picture: quantised black has no noise that shows."""
 PAPER_ERROR = 0.15
 """Relative standard deviation of the paper's fillings (`scripts/hole_fillings.py`)."""
 
@@ -74,7 +76,7 @@ def profile(evidence: Evidence, setting: Setting) -> tuple[Picture, Picture]:
         setting.surface,
         setting.slab,
         reach=evidence.reach,
-        noise=setting.noise,
+        noise=max(setting.noise, LEAST_NOISE * float(evidence.full[:, evidence.mask].median())),
         distance_px=setting.distance_px,
     )
     tiles, total = evidence.gather(spreading.tiles)

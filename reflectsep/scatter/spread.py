@@ -44,21 +44,23 @@ from reflectsep.solve.nonnegative import nonnegative_least_squares
 Picture = Float[Tensor, "channels height width"]
 Map = Float[Tensor, "height width"]
 
-NEXT = 2
-"""Frames on either side that say how much a pixel scatters."""
+NEXT = 1
+"""Frames on either side that say how much a pixel scatters: those farther say less of what is hidden."""
+SPOILT = 2
+"""Frames in a row that may be lost or clipped beside the lit interval."""
 INNER, RING, STRIDE = 4, 4, 3
 """Neighbours: every pixel up to INNER away, then blocks of STRIDE by STRIDE up to RING of them."""
 MARGIN = 0.1
 """Of a pixel's extent in frames by which a lit interval is taken to be longer: the passage is no surer."""
 NARROWEST, WIDEST = 0.05, 1.0
 """Limits of a pixel's extent in frames."""
-POOL_STEPS = 3.0
+POOL_STEPS = 4.0
 """Standard deviation of the neighbourhood that shares a spread, in steps of the slab."""
 CALM_PX = 1.5
-USUAL = 0.25
+USUAL = 0.1
 """Pixels that differ from their neighbours no more than this part of all do are taken for equal, and averaged."""
 MODEL_ERROR = 0.05
-RIDGE = 1e-5
+RIDGE = 3e-4
 MOST = 20.0
 """Of the median pixel's amplitude."""
 FIRST_WEIGHTS = (0.1, 0.3, 0.3, 0.2, 0.1)
@@ -231,7 +233,7 @@ class Spreading:
     def _ends(self, frame: Tensor, sound: Tensor, centre: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
         """Last frame before and first after the lit interval that say something."""
         before, after = (centre - margin).floor(), (centre + margin).ceil()
-        for _ in range(NEXT):
+        for _ in range(SPOILT):
             before = before - (~self._row(frame, sound, before)).float()
             after = after + (~self._row(frame, sound, after)).float()
         return before, after
@@ -306,13 +308,7 @@ class Spreading:
         if not self.lit.any():
             return torch.zeros_like(own)
         own = torch.where(self.lit, own.clamp(max=MOST * float(own[self.lit].median())), 0.0)
-        weight = model * self.lit
-        mass = gaussian(weight, CALM_PX).clamp(min=1e-20)
-        mean = gaussian(weight * own, CALM_PX) / mass
-        square = gaussian(weight * own.square(), CALM_PX) / mass
-        spread_ = (square / mean.square().clamp(min=1e-20) - 1.0).clamp(min=1e-9)
-        usual = 1.3 * quantile(spread_[self.lit], USUAL)
-        return mean + (1.0 - usual / spread_).clamp(min=0.0) * (own - mean)
+        return _calmed(own, model * self.lit, lambda spread_: 1.3 * quantile(spread_[self.lit], USUAL))
 
     def _sums(self, rows: slice) -> tuple[Tensor, Tensor]:
         """U - V and A of every scale at the pixels of some rows."""
@@ -335,6 +331,21 @@ class Spreading:
         beside *= beyond
         block.take_near(left_out)
         return left_out, beside
+
+
+def _calmed(own: Map, weight: Map, usual: Callable[[Map], Tensor]) -> Map:
+    """Each pixel's value, averaged with its neighbours' as far as these spread no more than usual (Lee 1980).
+
+    Args:
+        own: values.
+        weight: of each.
+        usual: from the relative variance about every pixel to the one that noise has.
+    """
+    mass = gaussian(weight, CALM_PX).clamp(min=1e-20)
+    mean = gaussian(weight * own, CALM_PX) / mass
+    square = gaussian(weight * own.square(), CALM_PX) / mass
+    spread_ = (square / mean.square().clamp(min=1e-20) - 1.0).clamp(min=1e-9)
+    return mean + (1.0 - usual(spread_) / spread_).clamp(min=0.0) * (own - mean)
 
 
 def _undarkened(tail: Picture, frames: int, dark: float) -> Picture:
