@@ -37,6 +37,7 @@ from reflectsep.io.exr import read_channels
 from reflectsep.io.pictures import write_picture
 from reflectsep.pipeline import alignment_of, measure
 from reflectsep.progress import silent
+from reflectsep.scatter.frames import signed_root
 
 PERIODS_PX = (2.0, 8.0)
 LEAST_COSINE = 0.866
@@ -78,7 +79,7 @@ def _with_truth(folder: Path, stack: PhotometricStack, found: Scattering, second
     deviation = found.root_sd if found.root_sd is not None else torch.full_like(found.root, torch.nan)
     n = float(found.n_d)
     return Measured(
-        scattering=found.root[:3] ** n,
+        scattering=signed_root(found.root[:3], 1.0 / n),
         truth=torch.stack([truth_of(folder, name) for name in names]),
         sd=deviation[:3],
         inner=stack.mask & (mean > bright),

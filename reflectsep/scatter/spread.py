@@ -27,6 +27,7 @@ all: then the passage is in whole frames, told by the brightest run of them, not
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -82,7 +83,13 @@ class Slab:
     @property
     def unsure(self) -> float:
         """Frames by which the passage may be off: of a slab no wider than its step it is known to a quarter only."""
-        return 0.25 if self.half < 0.75 else 0.0
+        return 0.25 if self.half < 0.75 and not self.whole else 0.0
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Whole frames in which a point may be lit."""
+        low, high = max(1, math.floor(self.width + 0.1)), max(1, math.ceil(self.width - 0.1))
+        return tuple({low, high})
 
     @property
     def width(self) -> float:
@@ -215,19 +222,26 @@ class Spreading:
         return torch.einsum("fcp,fp->cp", root, weight * width - 1.0) * profiles.lit
 
     def _passage(self, profiles: Profiles, frame: Tensor) -> Tensor:
-        """Middle of the lit interval: by the passage, or of the brightest run of whole frames near it."""
+        """Middle of the lit interval: by the passage, or of the run of whole frames that stands out most."""
         smooth = self.smooth.flatten()[profiles.at]
         if not self.slab.whole:
             return smooth
-        count = max(1, round(self.slab.width))
-        grey = profiles.root.mean(1)
-        first = (smooth - (count - 1) / 2).round() - frame[0]
-        runs = []
-        for move in (-1, 0, 1):
-            rows = (first + move)[None] + torch.arange(count)[:, None]
-            runs.append(grey.gather(0, rows.round().long().clamp(0, len(grey) - 1)).sum(0))
-        best = torch.stack(runs).argmax(0) - 1
-        found = frame[0] + first + best + (count - 1) / 2
+        grey, counts = profiles.root.mean(1), self.slab.counts
+        reach = max(counts) + 2
+        middle = (smooth - frame[0]).round().long()
+        near = (middle + torch.arange(-reach, reach + 1)[:, None]).clamp(0, len(grey) - 1)
+        value = grey.gather(0, near)
+        value = value - value.mean(0)
+        centres, contrasts = [], []
+        for count in counts:
+            first = (smooth - frame[0] - (count - 1) / 2).round()
+            for move in (-1, 0, 1):
+                rows = (first + move - middle + reach).long() + torch.arange(count)[:, None]
+                inside = value.gather(0, rows.clamp(0, 2 * reach)).sum(0).clamp(min=0.0)
+                # Variance between the frames of the run and the others (Otsu 1979).
+                contrasts.append(inside.square() / (count * (1 - count / (2 * reach + 1))))
+                centres.append(frame[0] + first + move + (count - 1) / 2)
+        found = torch.stack(centres).gather(0, torch.stack(contrasts).argmax(0)[None])[0]
         return torch.where(profiles.saturated.flatten(0, 1).any(0), smooth, found)
 
     def _ends(self, frame: Tensor, sound: Tensor, centre: Tensor, margin: Tensor) -> tuple[Tensor, Tensor]:
