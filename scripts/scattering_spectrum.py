@@ -81,7 +81,7 @@ def _with_truth(folder: Path, stack: PhotometricStack, found: Scattering, second
     return Measured(
         scattering=signed_root(found.root[:3], 1.0 / n),
         truth=torch.stack([truth_of(folder, name) for name in names]),
-        sd=deviation[:3],
+        sd=n * found.root[:3].abs().clamp(min=1e-9) ** (n - 1) * deviation[:3],
         inner=stack.mask & (mean > bright),
         pictures=pictures,
         axes=[next(s.direction for s in found.sweeps if s.light == name) for name in names],

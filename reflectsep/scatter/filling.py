@@ -29,8 +29,8 @@ from reflectsep.scatter.frames import Step, signed_root
 from reflectsep.scatter.geometry import Surface
 from reflectsep.scatter.spread import Slab, Spreading
 
-HIDDEN_ERROR, SHOWN_ERROR = 0.12, 0.01
-"""Relative standard deviations of what no frame shows, and of the rest (`scripts/scattering_spectrum.py`)."""
+HIDDEN_ERROR, PICTURE_ERROR = 0.12, 0.005
+"""Standard deviations relative to what no frame shows, and to the picture (`scripts/scattering_spectrum.py`)."""
 LEAST_NOISE = 1e-4
 """Of a frame, relative to the full picture: quantised black has no noise that shows."""
 PAPER_ERROR = 0.15
@@ -84,7 +84,7 @@ def profile(evidence: Evidence, setting: Setting) -> tuple[Picture, Picture]:
     passage = evidence.band.passage
     dark = passage.dark if evidence.n_d == 1.0 else 0.0
     found, hidden = spreading.finish(tiles, total, ceiling, frames=passage.received, dark=dark)
-    return found, (HIDDEN_ERROR * hidden).square_().add_((SHOWN_ERROR * found).square_()).sqrt_()
+    return found, (HIDDEN_ERROR * hidden).square_().add_((PICTURE_ERROR * ceiling).square_()).sqrt_()
 
 
 FILLINGS: dict[str, Filling] = {"profile": profile, "maximum": maximum, "interpolation": interpolation}

@@ -140,8 +140,7 @@ class Cells:
         self.shape = tuple(-(-length // self.side) for length in shape)
         self.width, self.slab, self.scales = shape[1], slab, scales(slab.step_px)
         count = self.shape[0] * self.shape[1]
-        self.normal = torch.zeros(channels, count, SCALES, SCALES)
-        self.right = torch.zeros(channels, count, SCALES)
+        self.sums = torch.zeros(channels, SCALES * SCALES + SCALES, count)
 
     def add(self, at: Tensor, distance: Tensor, value: Tensor, trust: Tensor, noise: float) -> None:
         """Frames beside the lit interval of some pixels.
@@ -157,22 +156,27 @@ class Cells:
         cell = row.div(self.side, rounding_mode="floor") * self.shape[1] + column.div(self.side, rounding_mode="floor")
         lines = torch.stack([strip(distance[0], s) - strip(distance[1], s) for s in self.scales])  # scale, frame, P
         nominal = torch.tensordot(torch.tensor(FIRST_WEIGHTS), lines, 1)
-        for c in range(len(self.normal)):
+        for c in range(len(self.sums)):
             own = value[:, c]
             size = 0.05 * 0.5 * own[:NEXT].clamp(min=0).sum(0) + noise / MODEL_ERROR + 1e-9
             weight = trust / (own.clamp(min=0) + size).square()
             amplitude = (weight * nominal * own).sum(0) / (weight * nominal.square()).sum(0).clamp(min=1e-20)
-            columns = (lines * amplitude.clamp(min=1e-6)).permute(2, 0, 1)  # P, scale, frame
-            weighted = columns * weight.T[:, None]
-            self.normal[c].index_add_(0, cell, weighted @ columns.mT)
-            self.right[c].index_add_(0, cell, (weighted @ own.T[..., None])[..., 0])
+            amplitude = amplitude.clamp(min=1e-6)
+            weight = weight * amplitude
+            weighted = [line * weight for line in lines]
+            normal = torch.zeros(SCALES, SCALES, len(at))
+            for i, each in enumerate(weighted):
+                for j in range(i + 1):
+                    normal[i, j] = normal[j, i] = (each * lines[j]).sum(0) * amplitude
+            right = torch.stack([(each * own).sum(0) for each in weighted])
+            self.sums[c].index_add_(1, cell, torch.cat([normal.flatten(0, 1), right]))
 
     def weights(self) -> Float[Tensor, "channels scales rows columns"]:
         """W of every square, from the squares around it."""
         sigma = POOL_STEPS * self.slab.step_px / self.side
-        channels = len(self.normal)
-        sums = torch.cat([self.normal.flatten(2), self.right], -1).permute(0, 2, 1).reshape(-1, *self.shape)
-        sums = torch.stack([gaussian(each, sigma) for each in sums]).view(channels, -1, sums[0].numel())
+        channels = len(self.sums)
+        maps = self.sums.flatten(0, 1).unflatten(1, self.shape)
+        sums = torch.stack([gaussian(each, sigma) for each in maps]).view(channels, -1, self.sums.shape[2])
         normal = sums[:, : SCALES * SCALES].reshape(channels, SCALES, SCALES, -1).permute(1, 2, 0, 3).flatten(2)
         right = sums[:, SCALES * SCALES :].permute(1, 0, 2).flatten(1)
         trace = torch.diagonal(normal).sum(-1)
