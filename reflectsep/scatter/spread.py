@@ -45,6 +45,8 @@ from reflectsep.solve.nonnegative import nonnegative_least_squares
 Picture = Float[Tensor, "channels height width"]
 Map = Float[Tensor, "height width"]
 
+FITTED = 6
+"""Frames on either side that the spread is fitted to."""
 NEXT = 1
 """Frames on either side that say how much a pixel scatters: those farther say less of what is hidden."""
 SPOILT = 2
@@ -280,7 +282,7 @@ class Spreading:
         pace = self.pace.flatten()[at]
         steep = ((self.slab.step_px / pace).clamp(max=1.0) * self.surface.facing.flatten()[at]) ** 4
         value, distance, trust = [], [], []
-        for i in range(self.reach):
+        for i in range(min(self.reach, FITTED)):
             for start, side in ((after, 1), (before, -1)):
                 index = start + side * i
                 away = (index - centre) * side
@@ -315,10 +317,10 @@ class Spreading:
             model[:, rows] = (own * beside).sum(1)
         for c in range(len(total)):
             gap[c] *= self._amplitude(self.next[c], model[c]) * self.slab.width
-        total = self.window + _undarkened(total - self.window, max(1, frames - 2 * self.reach), dark)
-        found = total + tiles + gap
+        shown = _undarkened(self.window + tiles, 2 * self.reach, dark)
+        shown += _undarkened(total - self.window, max(1, frames - 2 * self.reach), dark)
         # Of a pixel that is lit part of the picture is its own light.
-        return torch.where(self.lit, torch.minimum(found, ceiling.clamp(min=0.0)), total), gap
+        return torch.where(self.lit, torch.minimum(shown + gap, ceiling.clamp(min=0.0)), shown), gap
 
     def _amplitude(self, value: Map, model: Map) -> Map:
         """b, calmed: averaged with its neighbours' where these differ no more than is usual."""
@@ -367,7 +369,7 @@ def _calmed(own: Map, weight: Map, usual: Callable[[Map], Tensor]) -> Map:
 
 
 def _undarkened(tail: Picture, frames: int, dark: float) -> Picture:
-    """Sum of frames far from the slab without the mean of noise that was clipped at black.
+    """Sum of frames without the mean of noise that was clipped at black.
 
     For a signal s under noise of deviation e the mean is e f(s/e), f(x) = density(x) + x distribution(x), whose inverse
     is nearly sqrt(mean^2 - f(0)^2 e^2), and f(0) e is the mean where there is no light.
