@@ -17,6 +17,7 @@ from torch import Tensor
 
 from reflectsep.data import FrameStream
 from reflectsep.progress import Progress
+from reflectsep.room import empty
 from reflectsep.scatter.band import LitBand
 from reflectsep.scatter.frames import Step, signed_root, steps
 from reflectsep.scatter.passage import CACHED, tiles
@@ -51,7 +52,8 @@ class Evidence:
 
         A full pass over the files; the pixels come in parts, each as soon as its windows are complete.
         """
-        result, total = torch.zeros_like(self.full).flatten(1), self.band.passage.total
+        result = empty(*self.full.shape, dtype=self.full.dtype).zero_().flatten(1)
+        total = self.band.passage.total
         places: list[tuple[slice, ...]] = []
         if self.n_d != 1.0:
             total, places = torch.zeros_like(self.full), [(slice(None), *place) for place in tiles(self.mask, CACHED)]
@@ -63,7 +65,7 @@ class Evidence:
         with closing(self._profiles(visit)) as parts:
             for profiles in parts:
                 result[:, profiles.at] = wanted(profiles).to(result)
-        return result.view_as(self.full), total * self.mask
+        return result.view_as(self.full), total.mul_(self.mask)
 
     def _profiles(self, visit: Callable[[Step], None]) -> Generator[Profiles, None, None]:
         windows = Windows(

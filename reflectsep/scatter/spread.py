@@ -36,6 +36,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from reflectsep.room import empty
 from reflectsep.scatter.geometry import Surface
 from reflectsep.scatter.kernel import SCALES, scales, spread, strip
 from reflectsep.scatter.local import gaussian, quantile
@@ -209,7 +210,7 @@ class Spreading:
         self.cells = Cells(full.shape[1:], len(full), slab)
         self.lit = torch.zeros_like(centre, dtype=torch.bool)
         self.before, self.after = torch.zeros_like(centre), torch.zeros_like(centre)
-        self.next, self.window = torch.zeros_like(full), torch.zeros_like(full)
+        self.next, self.window = (empty(*full.shape, dtype=full.dtype).zero_() for _ in range(2))
 
     def tiles(self, profiles: Profiles) -> Float[Tensor, "channels P"]:
         """C Q - sum of the window's frames of some pixels; the rest is kept for `finish`."""
@@ -307,7 +308,7 @@ class Spreading:
             dark: mean of a frame without light.
         """
         weights = self.cells.weights()
-        gap, model = torch.zeros_like(total), torch.zeros_like(total)
+        gap, model = (empty(*total.shape, dtype=total.dtype) for _ in range(2))
         lines = max(1, ROWS_AT_ONCE // total.shape[2])
         for top in range(0, total.shape[1], lines):
             rows = slice(top, min(total.shape[1], top + lines))
@@ -317,10 +318,14 @@ class Spreading:
             model[:, rows] = (own * beside).sum(1)
         for c in range(len(total)):
             gap[c] *= self._amplitude(self.next[c], model[c]) * self.slab.width
-        shown = _undarkened(self.window + tiles, 2 * self.reach, dark)
-        shown += _undarkened(total - self.window, max(1, frames - 2 * self.reach), dark)
-        # Of a pixel that is lit part of the picture is its own light.
-        return torch.where(self.lit, torch.minimum(shown + gap, ceiling.clamp(min=0.0)), shown), gap
+        # A channel at a time: of a large picture there is no room for more.
+        for c in range(len(total)):
+            shown = _undarkened(self.window[c] + tiles[c], 2 * self.reach, dark)
+            shown += _undarkened(total[c] - self.window[c], max(1, frames - 2 * self.reach), dark)
+            # Of a pixel that is lit part of the picture is its own light.
+            most = torch.minimum(shown + gap[c], ceiling[c].clamp(min=0.0))
+            model[c] = torch.where(self.lit, most, shown)
+        return model, gap
 
     def _amplitude(self, value: Map, model: Map) -> Map:
         """b, calmed: averaged with its neighbours' where these differ no more than is usual."""
@@ -368,7 +373,7 @@ def _calmed(own: Map, weight: Map, usual: Callable[[Map], Tensor]) -> Map:
     return mean + (1.0 - usual(spread_) / spread_).clamp(min=0.0) * (own - mean)
 
 
-def _undarkened(tail: Picture, frames: int, dark: float) -> Picture:
+def _undarkened(tail: Map, frames: int, dark: float) -> Map:
     """Sum of frames without the mean of noise that was clipped at black.
 
     For a signal s under noise of deviation e the mean is e f(s/e), f(x) = density(x) + x distribution(x), whose inverse

@@ -112,25 +112,14 @@ class Windows:
         begin, end = self.open[0].pixels.start, self.open[-1].pixels.stop
         at = self.at[begin:end]
         values = step.values.flatten(1)[:, at]
-        hole = self._hole(step, values, slice(begin, end))
         root = signed_root(values, self.view.n_d)
         clipped = None if step.saturated is None else step.saturated.flatten(1)[:, at]
         for group in self.open:
             row, own = step.index - group.first, slice(group.pixels.start - begin, group.pixels.stop - begin)
-            group.root[row], group.hole[row] = root[:, own], hole[own]
+            group.root[row] = root[:, own]
             group.present[row] = not step.lost
             if clipped is not None:
                 group.clipped(row, clipped[:, own])
-
-    def _hole(self, step: Step, values: Tensor, pixels: slice) -> Tensor:
-        """As `LitBand.hole`, of some pixels; a lost frame in a window is a hole too: its neighbours may be lit."""
-        band, at = self.view.band, self.at[pixels]
-        if step.lost:
-            return torch.ones(len(at), dtype=torch.bool)
-        away, lit = (step.index - self.centre[pixels]).abs_(), band.lit.flatten()[at]
-        if band.threshold is None:
-            return lit & (away <= band.half + band.edge)
-        return lit & (away <= 2 * band.half + 2) & (values.mean(0) > band.threshold.flatten()[at])
 
     def _profiles(self, group: _Group) -> Profiles:
         band, at = self.view.band, self.at[group.pixels]
@@ -154,7 +143,6 @@ class _Group:
         self.first, self.pixels = first, pixels
         count = pixels.stop - pixels.start
         self.root = full.new_zeros((size, len(full), count))
-        self.hole = torch.zeros((size, count), dtype=torch.bool)
         self.present = torch.zeros(size, dtype=torch.bool)
         self.saturated = torch.zeros((), dtype=torch.bool).expand(self.root.shape)
 
@@ -172,7 +160,7 @@ def _lit(band: LitBand, group: _Group, offset: Tensor, at: Tensor) -> Tensor:
     some = (lit & band.doubtful.flatten()[at]).nonzero()[:, 0]
     if len(some):
         every = slice(None) if len(some) == len(at) else some
-        hole, value = group.hole[:, every], group.root[:, :, every]
+        value, hole = group.root[:, :, every], offset[:, every].abs() <= band.half + band.edge
         value = value[:, 0] if value.shape[1] == 1 else value.mean(1)
         beside = value.masked_fill(hole | ~group.present[:, None], 0.0).amax(0)
         # Only the rows in the middle may be the pixel's own.
