@@ -9,7 +9,7 @@ from reflectsep.scatter.exponent import GRID, Samples, solve_exponent
 from reflectsep.scatter.filling import fill_by_interpolation, fill_by_maximum
 from reflectsep.scatter.frames import signed_root, steps
 from reflectsep.scatter.kernel import spread, strip
-from reflectsep.scatter.spread import point_sampled
+from reflectsep.scatter.spread import _undarkened, point_sampled
 from reflectsep.scatter.width_fit import line_response
 from reflectsep.solve.nonnegative import nonnegative_least_squares
 
@@ -145,3 +145,13 @@ def test_a_camera_that_samples_points_is_told_by_divided_pixels(points):
     lit = (away <= half).float() if points else ((half - away) / wide + 0.5).clamp(0, 1)
     value = 0.1 + lit + 0.02 * torch.rand(lit.shape, generator=g)
     assert point_sampled([(value, index, centre, wide, half)]) == points
+
+
+@pytest.mark.parametrize("signal", [0.0, 0.5, 3.0])
+def test_noise_that_was_clipped_at_black_adds_nothing(signal):
+    g = torch.Generator().manual_seed(5)
+    frames, deviation = 60, 1e-3
+    clipped = (signal * deviation + deviation * torch.randn(frames, 40, 50, generator=g)).clamp(min=0.0)
+    dark = deviation / (2 * torch.pi) ** 0.5
+    found = _undarkened(clipped.sum(0), frames, dark) / frames
+    assert float(found.mean()) == pytest.approx(signal * deviation, abs=0.1 * deviation)
