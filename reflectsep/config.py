@@ -180,7 +180,7 @@ class ScatterSettings:
     """How the scattering comes out of the sweeps (Eqs. 23 to 25)."""
 
     key: ClassVar[str] = "scatter."
-    hole_filling: Literal["profile", "time", "maximum", "interpolation", "orthogonal"] = setting(
+    hole_filling: Literal["profile", "maximum", "interpolation"] = setting(
         "profile", "what stands in where the slab itself lit"
     )
     lit_band: Literal["threshold", "profile"] = setting("profile", "how the lit band of a frame is found")

@@ -69,12 +69,12 @@ def fails(capsys, words, code):
 
 
 def test_fit_takes_groups_and_paths(ran, capsys):
-    words = "capture=in out=there object=wax fit=lin_lee scatter=orthogonal rig=six overwrite=true"
+    words = "capture=in out=there object=wax fit=lin_lee scatter=maximum rig=six overwrite=true"
     assert main(["fit", *words.split()]) == 0
     (job,) = ran
     assert isinstance(job, FitJob)
     assert (job.capture, job.out, job.overwrite) == ("in", "there", True)
-    assert (job.fit.scattering, job.scatter.hole_filling, job.object.name) == ("none", "orthogonal", "wax")
+    assert (job.fit.scattering, job.scatter.hole_filling, job.object.name) == ("none", "maximum", "wax")
     assert capsys.readouterr().out == "done\n"
 
 
@@ -320,5 +320,5 @@ def test_help_lists_every_job_and_every_option(capsys):
     assert all(f"\n  {job} " in overview for job in JOBS)
     assert main(["fit", "--help"]) == 0
     text = capsys.readouterr().out
-    for word in ("capture=", "fit=lin_lee", "fit.n_s=null", "scatter=orthogonal", "scatter.threshold=0.25", "rig=six"):
+    for word in ("capture=", "fit=lin_lee", "fit.n_s=null", "scatter=maximum", "scatter.threshold=0.25", "rig=six"):
         assert word in text

@@ -84,7 +84,16 @@ def test_scripts_are_the_jobs(job):
 
 def test_there_is_one_script_a_job():
     measuring = (
-        *("benchmark", "fit_memory", "hole_fillings", "scaling", "seams", "shared_speed", "sweep_speed"),
+        *(
+            "benchmark",
+            "fit_memory",
+            "hole_fillings",
+            "scaling",
+            "seams",
+            "shared_speed",
+            "sweep_speed",
+            "scattering_spectrum",
+        ),
         "time_left",
     )
     several = ("tiles",)  # many fits

@@ -20,7 +20,7 @@ EXAMPLES = {
     "capture_and_fit": ("object=wax rig=simulated",),
     "fit": (
         "capture=captures/wax out=results/wax",
-        "object=wax fit=lin_lee scatter=orthogonal",
+        "object=wax fit=lin_lee scatter=maximum",
         "-m object=wax,pudding hydra/launcher=joblib",
     ),
     "relight": (

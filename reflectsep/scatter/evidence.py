@@ -17,6 +17,7 @@ from torch import Tensor
 
 from reflectsep.data import FrameStream
 from reflectsep.progress import Progress
+from reflectsep.room import empty
 from reflectsep.scatter.band import LitBand
 from reflectsep.scatter.frames import Step, signed_root, steps
 from reflectsep.scatter.passage import CACHED, tiles
@@ -46,46 +47,39 @@ class Evidence:
             for step in walked:
                 visit(step, signed_root(step.values, self.n_d), self.band.hole(step))
 
-    def fill(self, filling: Callable[[Profiles], Float[Tensor, "channels P"]]) -> Picture:
-        """Root sum of the frames, with `filling(profiles)` in place of the frames that are holes.
+    def gather(self, wanted: Callable[[Profiles], Float[Tensor, "channels P"]]) -> tuple[Picture, Picture]:
+        """`wanted(profiles)` of the object's pixels as a picture, and the root sum of the frames; nothing elsewhere.
 
         A full pass over the files; the pixels come in parts, each as soon as its windows are complete.
         """
-        if self.n_d == 1.0:
-            return self.gather(lambda p: filling(p) - p.unsound) + self.band.passage.total
-        total, places = torch.zeros_like(self.full), [(slice(None), *place) for place in tiles(self.mask, CACHED)]
+        result = empty(*self.full.shape, dtype=self.full.dtype).zero_().flatten(1)
+        total = self.band.passage.total
+        places: list[tuple[slice, ...]] = []
+        if self.n_d != 1.0:
+            total, places = torch.zeros_like(self.full), [(slice(None), *place) for place in tiles(self.mask, CACHED)]
 
-        def add(step: Step) -> None:
+        def visit(step: Step) -> None:
             for place in places:
                 total[place] += signed_root(step.values[place], self.n_d)
 
-        return self.gather(lambda p: filling(p) - p.unsound, add) + total * self.mask
-
-    def gather(
-        self, wanted: Callable[[Profiles], Float[Tensor, "channels P"]], visit: Callable[[Step], None] | None = None
-    ) -> Picture:
-        """`wanted(profiles)` of the object's pixels as a picture, nothing elsewhere; a full pass over the files."""
-        result = torch.zeros_like(self.full).flatten(1)
         with closing(self._profiles(visit)) as parts:
             for profiles in parts:
                 result[:, profiles.at] = wanted(profiles).to(result)
-        return result.view_as(self.full)
+        return result.view_as(self.full), total.mul_(self.mask)
 
-    def _profiles(self, visit: Callable[[Step], None] | None) -> Generator[Profiles, None, None]:
+    def _profiles(self, visit: Callable[[Step], None]) -> Generator[Profiles, None, None]:
         windows = Windows(
             View(
                 full=self.full,
                 mask=self.mask,
                 band=self.band,
-                direction=self.stream.sweep.direction,
                 n_d=self.n_d,
                 reach=self.reach,
             )
         )
         with closing(self._steps()) as walked:
             for step in walked:
-                if visit is not None:
-                    visit(step)
+                visit(step)
                 yield from windows.add(step)
         yield from windows.rest()
 

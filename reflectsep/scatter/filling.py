@@ -1,25 +1,15 @@
-"""What stands in for the scattering in the holes that the lit band leaves: five ways, one interface.
+"""What stands in for the scattering that the lit frames of a pixel hide: three ways, one interface.
 
-Each takes the evidence of a sweep and returns the root sum of its frames, holes filled. None but `profile` knows of a
-distance; each of the others stands for one nevertheless, that from which on it takes light for scattering.
+Each takes the evidence of a sweep and returns C times the scattering, with its standard deviation by the method.
 
+profile        every pixel: what the frames beside its lit interval hold, and a fitted spread for the light that none of
+               them shows (reflectsep/scatter/spread.py), beyond a distance that is a setting.
 maximum        every frame: the largest value on the hole's rim (paper). The rim lies against the slab.
 interpolation  every frame: a smooth surface through the hole's surroundings (paper), by normalised convolution with
                ever wider Gaussians.
-time           every pixel: a straight line across its own lit frames.
-orthogonal     every pixel: the mean of what the sweep of the same light the other way measured beside its own lit
-               interval (A u B = A + B - A n B: what one sweep lacks the other has, and the common part is averaged).
-               Without such a sweep: `time`.
-profile        every pixel: its profile as a sum of exponentials (reflectsep/scatter/kernel.py), with the distance a
-               setting.
 
-Relative RMS error on a path-traced wax blob (mean free path 1.44 px, slab 4 px wide, 2 px a frame), lit band by the
-interval in time, against the light that left more than 1 and more than 2 px from where it entered:
-
-    profile at 1 px   4.8 %   25 %       maximum        13.8 %  9.7 %       time                    26 %   14 %
-    profile at 2 px    16 %  5.7 %       interpolation    20 %  7.4 %       orthogonal (one light)  25 %   14 %
-
-So `profile` is the default, `interpolation` and `maximum` stand for about half the slab's width, and `time` for more.
+`maximum` and `interpolation` know of no distance; they stand for about half the slab's width
+(`scripts/hole_fillings.py` prints how far each is from light that left more than 1 and 2 pixels away).
 """
 
 from __future__ import annotations
@@ -29,18 +19,22 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from reflectsep.scatter.evidence import Evidence, Mask, Picture
-from reflectsep.scatter.frames import Step
-from reflectsep.scatter.kernel import Slab, fill_by_profile
-from reflectsep.scatter.windows import Profiles
+from reflectsep.scatter.frames import Step, signed_root
+from reflectsep.scatter.geometry import Surface
+from reflectsep.scatter.spread import Slab, Spreading
 
-CALM_STEPS = 0.75
-"""Standard deviation of the smoothing of filled profiles, in steps of the slab."""
+HIDDEN_ERROR, PICTURE_ERROR = 0.12, 0.005
+"""Standard deviations relative to what no frame shows, and to the picture (`scripts/scattering_spectrum.py`)."""
+LEAST_NOISE = 1e-4
+"""Of a frame, relative to the full picture: quantised black has no noise that shows."""
+PAPER_ERROR = 0.15
+"""Relative standard deviation of the paper's fillings (`scripts/hole_fillings.py`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,88 +45,56 @@ class Setting:
     distance_px: float
     noise: float
     """Standard deviation of a root frame."""
-    partner: Evidence | None = None
-    """The sweep of the same light the other way."""
-    partner_gain: float = 1.0
-    """C of this sweep over C of the partner."""
-    stretch: Float[Tensor, "height width"] | None = None
-    """Frames that a length along the surface takes, over those across the sheet of light; None: 1 everywhere."""
+    gain: float
+    """C."""
+    surface: Surface
 
 
 class Filling(Protocol):
-    """Root sum of a sweep's frames, holes filled, undivided by C."""
+    """C times the scattering, and its standard deviation by what the method supposes."""
 
-    def __call__(self, evidence: Evidence, setting: Setting) -> Picture:
+    def __call__(self, evidence: Evidence, setting: Setting) -> tuple[Picture, Picture]:
         """Fill the holes and sum."""
         ...
 
 
-def maximum(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
+def maximum(evidence: Evidence, setting: Setting) -> tuple[Picture, Picture]:  # noqa: ARG001
     """Every frame's holes by the largest value around them."""
     return _sum_frames(evidence, fill_by_maximum)
 
 
-def interpolation(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
+def interpolation(evidence: Evidence, setting: Setting) -> tuple[Picture, Picture]:  # noqa: ARG001
     """Every frame's holes by a smooth surface."""
     return _sum_frames(evidence, fill_by_interpolation)
 
 
-def time(evidence: Evidence, setting: Setting) -> Picture:  # noqa: ARG001
-    """Every pixel's lit frames by a straight line."""
-    return evidence.fill(fill_along_time)
+def profile(evidence: Evidence, setting: Setting) -> tuple[Picture, Picture]:
+    """Every pixel's hidden scattering by the spread that its neighbourhood shares."""
+    spreading = Spreading(
+        evidence.band.passage.centre,
+        evidence.full,
+        setting.surface,
+        setting.slab,
+        reach=evidence.reach,
+        noise=max(setting.noise, LEAST_NOISE * float(evidence.full[:, evidence.mask].median())),
+        distance_px=setting.distance_px,
+    )
+    tiles, total = evidence.gather(spreading.tiles)
+    ceiling = setting.gain * signed_root(evidence.full, evidence.n_d)
+    passage = evidence.band.passage
+    dark = passage.dark if evidence.n_d == 1.0 else 0.0
+    found, hidden = spreading.finish(tiles, total, ceiling, frames=passage.received, dark=dark)
+    return found, (HIDDEN_ERROR * hidden).square_().add_((PICTURE_ERROR * ceiling).square_()).sqrt_()
 
 
-def orthogonal(evidence: Evidence, setting: Setting) -> Picture:
-    """Every pixel's lit frames by what the other sweep saw beside its own."""
-    if setting.partner is None:
-        return time(evidence, setting)
-    beside = setting.partner_gain * setting.partner.gather(_beside).flatten(1)
-    return evidence.fill(lambda profiles: beside[:, profiles.at] * profiles.hole.sum(0))
+FILLINGS: dict[str, Filling] = {"profile": profile, "maximum": maximum, "interpolation": interpolation}
 
 
-def profile(evidence: Evidence, setting: Setting) -> Picture:
-    """Every pixel's lit frames by its fitted profile."""
-    stretch = None if setting.stretch is None else setting.stretch.flatten()
-
-    def fill(profiles: Profiles) -> Tensor:
-        distance = setting.distance_px if stretch is None else setting.distance_px * stretch[profiles.at]
-        return fill_by_profile(profiles, setting.slab, distance_px=distance, noise=setting.noise)
-
-    return calmed(evidence.fill(fill), evidence.mask, CALM_STEPS / setting.slab.frames_per_px)
-
-
-def calmed(root: Picture, mask: Mask, sigma_px: float) -> Picture:
-    """Stripes smoothed away, edges kept.
-
-    How near the closest unlit frame comes to a pixel changes with a period of one step of the slab, and what is filled
-    with it: stripes of some per cent. Scattered light is smooth, so a Gaussian of that width removes them; where a
-    pixel is farther from it than three times what is usual there is an edge of the material, and it stays as it is.
-    """
-    reach = 2 * max(1, round(3 * sigma_px)) + 1
-    blur = lambda p: gaussian_blur2d(p[None], (reach, reach), (sigma_px, sigma_px), "constant")[0]  # noqa: E731
-    smooth = blur(root * mask) / blur(mask[None].to(root)).clamp(min=1e-6)
-    away = (root - smooth).abs() / smooth.abs().clamp(min=1e-9)
-    bright = mask & (smooth.mean(0) > 0.05 * smooth.mean(0)[mask].max())
-    if not bright.any():
-        return root
-    usual = 1.4826 * away[:, bright].median()
-    return torch.where((away <= 3.0 * usual) & mask, smooth, root)
-
-
-FILLINGS: dict[str, Filling] = {
-    "profile": profile,
-    "maximum": maximum,
-    "interpolation": interpolation,
-    "orthogonal": orthogonal,
-    "time": time,
-}
-
-
-def _sum_frames(evidence: Evidence, fill: Callable[[Picture, Mask, Mask], Picture]) -> Picture:
+def _sum_frames(evidence: Evidence, fill: Callable[[Picture, Mask, Mask], Picture]) -> tuple[Picture, Picture]:
     """Sum of the frames, each filled by itself; a lost frame counts as the mean of its filled neighbours."""
     state = _FrameSum(evidence.full, evidence.mask, fill)
     evidence.walk(state.add)
-    return state.total
+    return state.total, PAPER_ERROR * state.total.abs()
 
 
 class _FrameSum:
@@ -200,42 +162,3 @@ def fill_by_interpolation(frame: Picture, hole: Mask, mask: Mask) -> Picture:
         open_ = open_ & ~reached
         sigma *= 2.0
     return result
-
-
-def fill_along_time(profiles: Profiles) -> Float[Tensor, "channels P"]:
-    """Sum over the holes of the line between the values on either side of them."""
-    before, after, since, until = _neighbours(profiles)
-    weight = (since / (since + until).clamp(min=1))[:, None]
-    line = torch.where(before.isnan(), after, torch.where(after.isnan(), before, torch.lerp(before, after, weight)))
-    return (line.nan_to_num(0.0) * profiles.hole[:, None]).sum(0)
-
-
-def _neighbours(profiles: Profiles) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Last value before and first after every frame that is no hole, NaN where there is none, and their distances."""
-    known = profiles.present & ~profiles.hole
-
-    def swept(order: list[int]) -> tuple[Tensor, Tensor]:
-        value = torch.full_like(profiles.root[0], torch.nan)
-        steps_since = torch.zeros_like(profiles.offset[0])
-        values, distances = torch.empty_like(profiles.root), torch.empty_like(profiles.offset)
-        for i in order:
-            value = torch.where(known[i], profiles.root[i], value)
-            steps_since = torch.where(known[i], 0.0, steps_since + 1)
-            values[i], distances[i] = value, steps_since
-        return values, distances
-
-    frames = list(range(len(known)))
-    before, since = swept(frames)
-    after, until = swept(frames[::-1])
-    return before, after, since, until
-
-
-def _beside(profiles: Profiles) -> Float[Tensor, "channels P"]:
-    """Mean of the last value before and the first after the middle frame that are no holes."""
-    before, after, _, _ = _neighbours(profiles)
-    return _mean_of(before[len(before) // 2], after[len(after) // 2])
-
-
-def _mean_of(a: Tensor, b: Tensor) -> Tensor:
-    """Mean of two, or the one that is there."""
-    return torch.where(a.isnan(), b, torch.where(b.isnan(), a, (a + b) / 2)).nan_to_num(0.0)

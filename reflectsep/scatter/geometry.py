@@ -1,20 +1,28 @@
-"""How far apart on the surface two frames of the slab are.
+"""How far apart on the surface two pixels are, and how much light each takes in.
 
-A distance that light has wandered is one along the surface, but frames count the slab's own motion. Where the surface
-leans along the slab, one frame's step covers a long stretch of it, so a distance takes fewer frames there:
-sqrt(1 - (N.m)^2) of them, m the normal of the sheet of light. Crude normals are enough; they come from the full
-pictures. On a path-traced wax it takes the error of the scattering beyond two pixels from 9 to 4 %.
+A distance that light has wandered is one along the surface, not in the picture. Crude normals are enough to tell it;
+they come from the full pictures.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reflectsep.data import PhotometricStack
+from reflectsep.scatter.local import gaussian
 
-LEAST = 0.25
+STEEPEST = 0.3
+"""Smallest N.V that is told apart."""
+DIMMEST = 0.05
+"""Smallest N.L of a pixel that is lit."""
+SMOOTHING_PX = 1.5
+"""Of slopes: a highlight bends the normals beside it."""
+SLOWEST = 0.15
+"""Frames a pixel below which a passage tells no distance."""
 SHADED = 0.12
 """Values below this share of a pixel's brightest picture are taken for attached shadow."""
 PIXELS_AT_ONCE = 1 << 16
@@ -49,12 +57,46 @@ def _normals(grey: Float[Tensor, "pixels lights"], L: Float[Tensor, "lights 3"])
     return torch.nn.functional.normalize(scaled, dim=-1)
 
 
-def surface_stretch(
-    normals: Float[Tensor, "height width 3"] | None, light: Float[Tensor, "3"], axis: str
-) -> Float[Tensor, "height width"] | None:
-    """Frames that a pixel's length along the surface takes, over those it takes across the sheet of light."""
-    if normals is None:
-        return None
-    along = torch.tensor([0.0, 1.0, 0.0] if axis == "x" else [1.0, 0.0, 0.0])
-    sheet = torch.nn.functional.normalize(torch.linalg.cross(light.float(), along), dim=0)
-    return (1.0 - (normals @ sheet).square()).clamp(min=LEAST**2).sqrt()
+@dataclass(frozen=True, kw_only=True)
+class Surface:
+    """Shape of what is seen, under one light; flat, and evenly lit, where normals are not known."""
+
+    slope_x: Float[Tensor, "height width"]
+    slope_y: Float[Tensor, "height width"]
+    """By how much it rises towards the camera from a pixel to the next, to the right and down."""
+    facing: Float[Tensor, "height width"]
+    """N.V."""
+    light: Float[Tensor, "height width"]
+    """Light that a pixel takes in: N.L times its area on the surface."""
+
+    def pace(self, centre: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+        """Pixels along the surface that the slab moves in a frame."""
+        down, across = torch.gradient(centre)
+        a, b = self.slope_x, self.slope_y
+        # |grad c| in the metric [[1 + a^2, a b], [a b, 1 + b^2]] of the surface.
+        square = (1 + b * b) * across**2 - 2 * a * b * across * down + (1 + a * a) * down**2
+        return (square / (1 + a * a + b * b)).clamp(min=SLOWEST**2).rsqrt()
+
+
+def surface_under(
+    normals: Float[Tensor, "height width 3"] | None,
+    light: Float[Tensor, "3"] | None,
+    mask: Bool[Tensor, "height width"],
+) -> Surface:
+    """The surface by crude normals (x right, y up, z to the camera), as a light reaches it."""
+    flat, even = torch.zeros(mask.shape), torch.ones(mask.shape)
+    if normals is None or light is None:
+        return Surface(slope_x=flat, slope_y=flat, facing=even, light=even)
+    z = normals[..., 2].clamp(min=STEEPEST)
+    weight = mask.float()
+    mass = gaussian(weight, SMOOTHING_PX).clamp(min=1e-6)
+
+    def smooth(each: Tensor) -> Tensor:
+        return gaussian(each * weight, SMOOTHING_PX) / mass
+
+    return Surface(
+        slope_x=smooth(-normals[..., 0] / z),
+        slope_y=smooth(normals[..., 1] / z),
+        facing=normals[..., 2].clamp(0, 1),
+        light=smooth((normals @ light.float()).clamp(min=DIMMEST) / z),
+    )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import conv2d, pad
 
 
 def box_sum(
@@ -32,3 +33,12 @@ def quantile(values: Float[Tensor, "*shape"], q: float) -> Float[Tensor, ""]:
     low, high = math.floor(place), math.ceil(place)
     lower = values.kthvalue(low + 1).values
     return lower if high == low else lower.lerp(values.kthvalue(high + 1).values, place - low)
+
+
+def gaussian(picture: Float[Tensor, "height width"], sigma: float) -> Float[Tensor, "height width"]:
+    """Mean over neighbours with Gaussian weights, nothing beyond the border."""
+    reach = max(1, math.ceil(3 * sigma))
+    bell = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=picture.dtype) / sigma) ** 2)
+    bell = bell / bell.sum()
+    rows = conv2d(picture[None, None], bell[None, None, None], padding=(0, reach))
+    return conv2d(rows, bell[None, None, :, None], padding=(reach, 0))[0, 0]

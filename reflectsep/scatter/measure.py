@@ -27,12 +27,12 @@ from reflectsep.scatter.exponent import complete
 from reflectsep.scatter.filling import FILLINGS, Setting
 from reflectsep.scatter.frames import name_of, signed_root
 from reflectsep.scatter.gains import Gains, choose_samples, exponents, same_ratio, solve_gains
-from reflectsep.scatter.geometry import crude_normals, surface_stretch
-from reflectsep.scatter.kernel import Slab
+from reflectsep.scatter.geometry import crude_normals, surface_under
 from reflectsep.scatter.local import box_sum, quantile
 from reflectsep.scatter.options import ScatterOptions
 from reflectsep.scatter.passage import Passage, speed_deviation, watch
 from reflectsep.scatter.shared import summed, watched
+from reflectsep.scatter.spread import Slab, extent, point_sampled
 
 LEAST_COVERAGE = 0.9
 DOUBTFUL = 0.6
@@ -101,16 +101,14 @@ def _measured(
     passages = watched(sweeps, passage)
     gains = solve_gains(stack, lights, passages, chosen, options)
     prepared = _prepare(stack, sweeps, lights, passages, gains, options, progress)
-    warnings = list(gains.warnings) + _warn(prepared, options)
+    warnings = list(gains.warnings) + _warn(prepared)
     normals = crude_normals(stack)
 
-    def root_sum(i: int) -> Picture:
-        p = prepared[i]
-        return _root_sum(p, prepared, gains.n_d, options, _stretch(stack, normals, p)).div_(p.gain)
+    def root_sum(i: int) -> tuple[Picture, Picture]:
+        return _root_sum(stack, prepared[i], gains.n_d, options, normals)
 
     sums = summed([p.clipped_elsewhere for p in prepared], root_sum)
-    noise = [_root_sd(p, gains.n_d) for p in prepared]
-    root, root_sd, measured = _combine(stack, lights, sums, noise)
+    root, root_sd, measured = _combine(stack, lights, sums)
     return Scattering(
         root=root,
         root_sd=root_sd,
@@ -154,6 +152,7 @@ def _prepare(
     steps_px = _steps_px(passages, stack.mask)
     if options.held is not None:
         steps_px = [options.held.of(p.sweep.light, p.sweep.direction).step_px for p in passages]
+    slabs = _slabs(passages, gains, steps_px, options)
     prepared = []
     for i, (stream, k, passage) in enumerate(zip(sweeps, lights, passages, strict=True)):
         reached, coverage = _coverage(stack.images[k], passage, stack.mask)
@@ -163,8 +162,7 @@ def _prepare(
                 f"{LEAST_COVERAGE:.0%}: the sweep is shorter than the object"
             )
         lit_frames, gain = gains.lit_frames[i], gains.gains[i]
-        equal = options.lit_frames is None and same_ratio(gain, lit_frames)
-        slab = _slab(gain if equal else lit_frames, steps_px[i])
+        slab = slabs[i]
         # Frame over full picture of a pixel that the slab lights alone.
         ratio = (gain / (2 * slab.half)) ** gains.n_d
         level = options.threshold * ratio * stack.images[k].mean(0)
@@ -172,8 +170,7 @@ def _prepare(
         band = LitBand(
             passage=passage,
             half=slab.half,
-            # Of a slab no wider than its step the passage is known to a quarter of a frame only.
-            edge=slab.edge + (0.25 if slab.half < 0.75 else 0.0),
+            edge=_edge(slab),
             lit=lit,
             doubtful=(passage.peak < DOUBTFUL * ratio) & ~passage.clipped,
             threshold=level if options.lit_band == "threshold" else None,
@@ -228,12 +225,25 @@ def _steps_px(passages: list[Passage], mask: Tensor) -> list[float]:
     return shared
 
 
-def _slab(lit_frames: float, step_px: float) -> Slab:
-    half = max(0.5, lit_frames / 2)
-    frames_per_px = 1.0 / step_px
-    # Half a pixel's own extent, and a little for the passage's error.
-    edge = min(max(0.5 * frames_per_px + 0.05, 0.15), 0.8 * half)
-    return Slab(half=half, edge=edge, frames_per_px=frames_per_px)
+def _slabs(passages: list[Passage], gains: Gains, steps_px: list[float], options: ScatterOptions) -> list[Slab]:
+    """The slab of every sweep; of one camera pixels are points in all of them or in none."""
+    halves = []
+    for gain, lit_frames in zip(gains.gains, gains.lit_frames, strict=True):
+        equal = options.lit_frames is None and same_ratio(gain, lit_frames)
+        halves.append(max(0.5, (gain if equal else lit_frames) / 2))
+    seen = []
+    for passage, half in zip(passages, halves, strict=True):
+        kept, wide = passage.kept, extent(passage.centre)
+        clear = passage.narrow.flatten()[kept.at] & ~kept.spoilt.any(0)
+        at = kept.at[clear]
+        seen.append((kept.value[:, clear], kept.index, passage.centre.flatten()[at], wide.flatten()[at], half))
+    whole = point_sampled(seen)
+    return [Slab(half=half, step_px=step, whole=whole) for half, step in zip(halves, steps_px, strict=True)]
+
+
+def _edge(slab: Slab) -> float:
+    """Frames around its edge in which a patch may be lit in part: half a pixel's extent, and the passage's error."""
+    return min(max(0.5 / slab.step_px + 0.05, 0.15), 0.8 * slab.half) + slab.unsure
 
 
 def _coverage(full: Tensor, passage: Passage, mask: Tensor) -> tuple[Tensor, float]:
@@ -254,7 +264,7 @@ def _coverage(full: Tensor, passage: Passage, mask: Tensor) -> tuple[Tensor, flo
     return reached, float(reached[bright].float().mean())
 
 
-def _warn(prepared: list[_Prepared], options: ScatterOptions) -> list[str]:
+def _warn(prepared: list[_Prepared]) -> list[str]:
     warnings = []
     for p in prepared:
         sweep, passage = p.evidence.stream.sweep, p.evidence.band.passage
@@ -263,55 +273,38 @@ def _warn(prepared: list[_Prepared], options: ScatterOptions) -> list[str]:
             warnings.append(f"{name_of(sweep)}: {gaps} frames lost; their scattering is interpolated")
         if p.report.coverage < 0.99:
             warnings.append(f"{name_of(sweep)}: the slab reached {p.report.coverage:.1%} of the object")
-        if options.hole_filling == "orthogonal" and _partner(p, prepared) is None:
-            warnings.append(
-                f"{name_of(sweep)}: no sweep of {sweep.light} the other way; its holes are filled along time"
-            )
     return warnings
 
 
-def _partner(p: _Prepared, prepared: list[_Prepared]) -> _Prepared | None:
-    for other in prepared:
-        if other.light == p.light and other.report.direction != p.report.direction:
-            return other
-    return None
-
-
-def _stretch(stack: PhotometricStack, normals: Tensor | None, p: _Prepared) -> Tensor | None:
-    if normals is None or stack.light_vectors is None:
-        return None
-    return surface_stretch(normals, stack.light_vectors[p.light], p.evidence.stream.sweep.direction)
-
-
 def _root_sum(
-    p: _Prepared, prepared: list[_Prepared], n_d: float, options: ScatterOptions, stretch: Tensor | None
-) -> Tensor:
-    other = _partner(p, prepared) if options.hole_filling == "orthogonal" else None
+    stack: PhotometricStack, p: _Prepared, n_d: float, options: ScatterOptions, normals: Tensor | None
+) -> tuple[Picture, Picture]:
+    """The scattering root by one sweep, and its standard deviation by noise and method."""
+    light = None if stack.light_vectors is None else stack.light_vectors[p.light]
     setting = Setting(
         slab=p.slab,
         distance_px=options.distance_px,
         noise=_root_noise(p, n_d),
-        partner=None if other is None else other.evidence,
-        partner_gain=1.0 if other is None else p.gain / other.gain,
-        stretch=stretch,
+        gain=p.gain,
+        surface=surface_under(normals, light, stack.mask),
     )
-    return copied(FILLINGS[options.hole_filling](p.evidence, setting).mul_(p.evidence.mask))
+    found, deviation = FILLINGS[options.hole_filling](p.evidence, setting)
+    variance = deviation.square_() + _root_noise(p, n_d) ** 2 * _noisy_frames(p)
+    return copied(found.mul_(stack.mask / p.gain)), copied(variance.sqrt_().mul_(stack.mask / p.gain))
 
 
 def _root_noise(p: _Prepared, n_d: float) -> float:
     return float(signed_root(torch.tensor(p.evidence.band.passage.noise), n_d))
 
 
-def _root_sd(p: _Prepared, n_d: float) -> Tensor:
-    """Noise of the frames in s: every frame's own, and three times it for each frame that had to be filled."""
-    passage = p.evidence.band.passage
-    holes = 2 * p.slab.half * p.evidence.band.lit
-    count = (passage.received - holes).clamp(min=0) + (3 * holes) ** 2
-    return (_root_noise(p, n_d) * count.sqrt() / p.gain * p.evidence.mask).expand_as(p.evidence.full)
+def _noisy_frames(p: _Prepared) -> Tensor:
+    """Frames' variances in the sum: every C-th counts C times over, and those beside the slab for the hidden light."""
+    tiled = min(2.0 * p.evidence.reach, p.evidence.band.passage.received) * (2 * p.slab.half)
+    return p.evidence.band.passage.received + p.evidence.band.lit * (tiled + (3 * 2 * p.slab.half) ** 2)
 
 
 def _combine(
-    stack: PhotometricStack, lights: list[int], sums: list[Picture], noise: list[Picture]
+    stack: PhotometricStack, lights: list[int], sums: list[tuple[Picture, Picture]]
 ) -> tuple[Tensor, Tensor, tuple[bool, ...]]:
     """Average the sweeps of each light; mix the lights without one from the basis."""
     measured = tuple(k in lights for k in range(len(stack.names)))
@@ -319,8 +312,8 @@ def _combine(
     for k in set(lights):
         own = [i for i, light in enumerate(lights) if light == k]
         for c in range(root.shape[1]):
-            root[k, c] = torch.stack([sums[i][c] for i in own]).mean(0)
-            variance[k, c] = (torch.stack([noise[i][c] for i in own]) ** 2).sum(0) / len(own) ** 2
+            root[k, c] = torch.stack([sums[i][0][c] for i in own]).mean(0)
+            variance[k, c] = (torch.stack([sums[i][1][c] for i in own]) ** 2).sum(0) / len(own) ** 2
     alpha = stack.alpha.to(root)
     for j, has in enumerate(measured):
         for c in range(0 if has else root.shape[1]):

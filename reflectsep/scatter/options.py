@@ -9,7 +9,7 @@ from typing import Literal
 from reflectsep.data import SweepReport
 from reflectsep.errors import SettingsError
 
-HoleFilling = Literal["profile", "maximum", "interpolation", "orthogonal", "time"]
+HoleFilling = Literal["profile", "maximum", "interpolation"]
 LitBand = Literal["threshold", "profile"]
 
 
@@ -46,7 +46,8 @@ class ScatterOptions:
     hole_filling: HoleFilling = "profile"
     """What stands in where the slab itself lit (see reflectsep/scatter/filling.py)."""
     lit_band: LitBand = "profile"
-    """Lit frames of a pixel: those near its passage that exceed `threshold`, or those of its lit interval in time."""
+    """Fillings `maximum` and `interpolation` only. Lit frames of a pixel: those near its passage that exceed
+    `threshold`, or those of its lit interval in time."""
     threshold: float = 0.25
     """Frame over full picture, both on one scale, above which a pixel is lit."""
     n_d: float | None = None

@@ -12,6 +12,7 @@ bound by memory, so that a tile of the picture is worked on for several frames w
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -67,6 +68,8 @@ class Passage:
     received: int
     noise: float
     """Standard deviation of a frame's pixel where it is dark, from differences along time."""
+    dark: float
+    """Mean of the darkest frame: what is left of the black level, or of noise that was clipped at it."""
     sums: Float[Tensor, "exponents samples"]
     """Sums of the frames' roots at the sampled values, one row an exponent (for Eq. 25)."""
     lost_away: Float[Tensor, "height width"]
@@ -183,6 +186,7 @@ class _Sums:
         self.indices: list[int] = []
         self.recent: list[Tensor] = []
         self.noises: list[float] = []
+        self.dark = math.inf
 
     def add(self, step: Step) -> None:
         self.indices.append(step.index)
@@ -198,6 +202,8 @@ class _Sums:
         logs = chosen.abs().clamp_min(torch.finfo(chosen.dtype).tiny).log()
         self.sums += (logs * self.powers[:, None]).exp_() * chosen.sign()
         self._take_noise(chosen, step.lost)
+        if len(chosen):
+            self.dark = min(self.dark, float(chosen.mean()))
 
     def _add_waiting(self) -> None:
         for tile in self.tiles:
@@ -234,6 +240,7 @@ class _Sums:
             last=self.indices[-1],
             received=received,
             noise=float(torch.tensor(self.noises).quantile(0.25)) if self.noises else 0.0,
+            dark=self.dark if math.isfinite(self.dark) else 0.0,
             sums=self.sums,
             lost_away=copied(lost_away),
             kept=kept,

@@ -15,7 +15,13 @@ from reflectsep.scatter.passage import Passage
 from reflectsep.scatter.width import Kept
 from reflectsep.solve.sharing import by_turns
 
-NUMBERS = {"first": torch.int64, "last": torch.int64, "received": torch.int64, "noise": torch.float64}
+NUMBERS = {
+    "first": torch.int64,
+    "last": torch.int64,
+    "received": torch.int64,
+    "noise": torch.float64,
+    "dark": torch.float64,
+}
 
 
 def watched(streams: Sequence[FrameStream], watch: Callable[[int], Passage]) -> list[Passage]:
@@ -43,17 +49,20 @@ def passage_of(stream: FrameStream, tensors: dict[str, Tensor]) -> Passage:
     return Passage(sweep=stream.sweep, kept=Kept(**kept), **values)
 
 
-def summed(clipped: Sequence[Mask], root_sum: Callable[[int], Picture]) -> list[Picture]:
-    """Root sums of all sweeps; `root_sum` makes one, and writes its pixels that are clipped elsewhere to `clipped`.
+def summed(
+    clipped: Sequence[Mask], root_sum: Callable[[int], tuple[Picture, Picture]]
+) -> list[tuple[Picture, Picture]]:
+    """Roots and their deviations by all sweeps; `root_sum` makes one, and tells `clipped` what is clipped elsewhere.
 
     Raises:
         WorkerError: another process of the run is gone.
     """
 
     def one(i: int) -> dict[str, Tensor]:
-        return {"sum": root_sum(i), "clipped": clipped[i]}
+        found, deviation = root_sum(i)
+        return {"sum": found, "deviation": deviation, "clipped": clipped[i]}
 
     found = by_turns(len(clipped), one)
     for mask, each in zip(clipped, found, strict=True):
         mask |= each["clipped"]  # noqa: PLW2901  (in its place)
-    return [each["sum"] for each in found]
+    return [(each["sum"], each["deviation"]) for each in found]

@@ -3,9 +3,10 @@
 Counting (width.py) takes the scattering within the lit interval for that beside it, which is off by 1 to 3 per cent on
 wax and pudding, and by 5 to 7 where the width is no whole number of steps. Here every pixel's frames are fitted by what
 they are, a plateau with the width of the slab and edges as wide as a pixel, and line spreads of the same slab on either
-side (kernel.py),
+side,
 
     v(u) = D clamp((h + e - |u|) / 2 e, 0, 1) + sum_i [A-_i E-(u; s_i, h) + A+_i E+(u; s_i, h)],     D, A >= 0
+    E-(u; s) = e^(min(u+h,0)/s) - e^(min(u-h,0)/s),    E+(u; s) = E-(-u; s)
 
 and the width 2 h, one for all pixels, is where they leave least. A frame that is lit in part goes from dark to bright
 within 2 e, so that hundreds of pixels tell the width to some parts in a thousand.
@@ -13,14 +14,17 @@ within 2 e, so that hundreds of pixels tell the width to some parts in a thousan
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from reflectsep.scatter.kernel import Slab, line_response, scales
 from reflectsep.scatter.width import FEWEST, Kept
 from reflectsep.solve.nonnegative import nonnegative_least_squares
 
+SMALLEST_SCALE, LARGEST_SCALE = 0.35, 2.8
+"""Of the line spreads, in frames; the largest for half a slab of a frame."""
 PIXELS = 800
 """Pixels at most that are fitted."""
 REACH = 6.0
@@ -83,6 +87,24 @@ def fitted_width(
     return best * _lowest(FINE, fine)
 
 
+def scales(half: float) -> Float[Tensor, "scales"]:
+    """Scales of the exponentials in frames, a factor of two apart: from what a frame resolves to nearly three slabs."""
+    count = 1 + round(math.log2(LARGEST_SCALE * max(1.0, half) / SMALLEST_SCALE))
+    return SMALLEST_SCALE * 2.0 ** torch.arange(count, dtype=torch.float32)
+
+
+def line_response(
+    u: Float[Tensor, "frames values"], half: float, s: Float[Tensor, "scales"]
+) -> Float[Tensor, "frames sides_scales values"]:
+    """E- then E+ for every scale, of a slab at offset u; the sum over frames a unit step apart is 2 h."""
+    columns = []
+    for side in (u, -u):
+        v, scale = side[:, None, :], s[:, None]
+        far, near = ((half - v) / scale).clamp(min=0), ((-half - v) / scale).clamp(min=0)
+        columns.append(torch.exp(-near) - torch.exp(-far))
+    return torch.cat(columns, 1)
+
+
 def _clear(kept: Kept, offset: Tensor, narrow: Tensor, guess: float) -> Int[Tensor, "some"]:
     """Pixels with all frames near their passage sound, whose lit frames stand out."""
     away = offset.abs()
@@ -107,7 +129,7 @@ def _left(
 ) -> Float[Tensor, "P"]:
     """Squared residual of every pixel's best profile for a width."""
     plateau = ((half + edge - u.abs()) / (2.0 * edge)).clamp(0.0, 1.0)
-    spread = line_response(u, half, scales(Slab(half=half, edge=edge, frames_per_px=2.0 * edge)))
+    spread = line_response(u, half, scales(half))
     columns = torch.cat([spread, plateau[:, None]], 1)
     normal = torch.einsum("fap,fbp,fp->abp", columns, columns, weight)
     normal = normal + RIDGE * torch.eye(len(normal))[..., None]

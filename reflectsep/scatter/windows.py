@@ -7,27 +7,20 @@ of its window, so that only the pixels near the slab hold frames: memory does no
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import conv1d
 
 from reflectsep.scatter.band import LitBand
 from reflectsep.scatter.frames import Step, signed_root
 
 TOGETHER = 1 << 12
 """Pixels that are handed on at a time, at least: fewer do not pay for the calls."""
-BLUR_PX = 4.0
-"""Along the slab, of the light it brings."""
 OUTSHINE = 1.1
-FULL_LIGHT = 0.3
-"""Part of the brightest row's sum from which on a slab is taken to bring all its light: what the camera sees of it
-depends on how a surface is turned, what enters does not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,29 +30,13 @@ class Profiles:
     root: Float[Tensor, "frames channels P"]
     offset: Float[Tensor, "frames P"]
     """Frame minus passage; frames are a unit step apart, and the middle one is within half a frame of the passage."""
-    hole: Bool[Tensor, "frames P"]
-    """Not scattering alone, or not received: to be filled."""
     present: Bool[Tensor, "frames P"]
     """Received."""
     lit: Bool[Tensor, "P"]
     """Pixels that the slab lights at all."""
     saturated: Bool[Tensor, "frames channels P"]
-    light: Float[Tensor, "frames P"]
-    """Light that a frame's slab brings to the object in the pixel's row (column, for a sweep along y), relative to the
-    frames that light the pixel itself."""
     at: Int[Tensor, "P"]
     """Place of each pixel in the flattened picture."""
-
-    def part(self, pixels: slice | Tensor) -> Profiles:
-        """The same for some of the pixels."""
-        return replace(self, **{k: v[..., pixels] for k, v in vars(self).items()})
-
-    @property
-    def unsound(self) -> Float[Tensor, "channels P"]:
-        """Sum of the root frames that are to be filled, as they are."""
-        unsound = self.hole | ~self.present
-        rows = unsound.any(1).nonzero()[:, 0]
-        return (self.root[rows] * unsound[rows, None]).sum(0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +46,6 @@ class View:
     full: Float[Tensor, "channels height width"]
     mask: Bool[Tensor, "height width"]
     band: LitBand
-    direction: str
     n_d: float
     reach: int
     """Frames on either side of the lit interval."""
@@ -92,13 +68,11 @@ class Windows:
         self.begun = 0
         self.open: deque[_Group] = deque()
         self.done: list[Profiles] = []
-        self.light = _Light(self)
 
     def add(self, step: Step) -> Iterator[Profiles]:
         """Put a frame into the windows that hold it; profiles that are complete, many at a time."""
         self._open_until(step.index)
         self._close_until(step.index)
-        self.light.take(step.index)
         if self.open:
             self._put(step)
         self._close_until(step.index + 1)
@@ -138,40 +112,26 @@ class Windows:
         begin, end = self.open[0].pixels.start, self.open[-1].pixels.stop
         at = self.at[begin:end]
         values = step.values.flatten(1)[:, at]
-        hole = self._hole(step, values, slice(begin, end))
         root = signed_root(values, self.view.n_d)
         clipped = None if step.saturated is None else step.saturated.flatten(1)[:, at]
         for group in self.open:
             row, own = step.index - group.first, slice(group.pixels.start - begin, group.pixels.stop - begin)
-            group.root[row], group.hole[row] = root[:, own], hole[own]
+            group.root[row] = root[:, own]
             group.present[row] = not step.lost
             if clipped is not None:
                 group.clipped(row, clipped[:, own])
-
-    def _hole(self, step: Step, values: Tensor, pixels: slice) -> Tensor:
-        """As `LitBand.hole`, of some pixels; a lost frame in a window is a hole too: its neighbours may be lit."""
-        band, at = self.view.band, self.at[pixels]
-        if step.lost:
-            return torch.ones(len(at), dtype=torch.bool)
-        away, lit = (step.index - self.centre[pixels]).abs_(), band.lit.flatten()[at]
-        if band.threshold is None:
-            return lit & (away <= band.half + band.edge)
-        return lit & (away <= 2 * band.half + 2) & (values.mean(0) > band.threshold.flatten()[at])
 
     def _profiles(self, group: _Group) -> Profiles:
         band, at = self.view.band, self.at[group.pixels]
         offset = group.first + torch.arange(self.size)[:, None] - self.centre[group.pixels]
         present = group.present[:, None].expand(-1, len(at))
         lit = _lit(band, group, offset, at)
-        light = self.light.around(group.first, at)
         return Profiles(
             root=group.root,
             offset=offset,
-            hole=group.hole & (lit | ~present),
             present=present,
             lit=lit,
             saturated=group.saturated,
-            light=_relative(light, offset.abs() <= max(0.5, band.half)),
             at=at,
         )
 
@@ -183,7 +143,6 @@ class _Group:
         self.first, self.pixels = first, pixels
         count = pixels.stop - pixels.start
         self.root = full.new_zeros((size, len(full), count))
-        self.hole = torch.zeros((size, count), dtype=torch.bool)
         self.present = torch.zeros(size, dtype=torch.bool)
         self.saturated = torch.zeros((), dtype=torch.bool).expand(self.root.shape)
 
@@ -201,7 +160,7 @@ def _lit(band: LitBand, group: _Group, offset: Tensor, at: Tensor) -> Tensor:
     some = (lit & band.doubtful.flatten()[at]).nonzero()[:, 0]
     if len(some):
         every = slice(None) if len(some) == len(at) else some
-        hole, value = group.hole[:, every], group.root[:, :, every]
+        value, hole = group.root[:, :, every], offset[:, every].abs() <= band.half + band.edge
         value = value[:, 0] if value.shape[1] == 1 else value.mean(1)
         beside = value.masked_fill(hole | ~group.present[:, None], 0.0).amax(0)
         # Only the rows in the middle may be the pixel's own.
@@ -211,48 +170,3 @@ def _lit(band: LitBand, group: _Group, offset: Tensor, at: Tensor) -> Tensor:
         mean = (value[rows] * own).sum(0) / own.sum(0).clamp(min=1)
         lit[some] = ~(own.any(0) & (mean < OUTSHINE * beside))
     return lit
-
-
-class _Light:
-    """What the slab of each of the last frames lights, summed across it and blurred along it."""
-
-    def __init__(self, windows: Windows) -> None:
-        view = windows.view
-        height, width = view.mask.shape
-        self.windows, self.width, self.along_x = windows, width, view.direction == "x"
-        self.grey = view.full.mean(0).clamp(min=0.0).flatten()[windows.at]
-        self.count = height if self.along_x else width
-        radius = min(12, self.count - 1)
-        taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / BLUR_PX) ** 2)
-        self.taps = (taps / taps.sum()).to(view.full)
-        self.lines: dict[int, Tensor] = {}
-
-    def take(self, index: int) -> None:
-        """Work out what a frame's slab lights."""
-        windows, half = self.windows, self.windows.view.band.half
-        # Only pixels that are passed about now; the windows' order has them together.
-        low, high = index - half - 1.5 - windows.reach, index + half + 1.5 - windows.reach
-        begin = windows.starts[bisect_left(windows.firsts, low)]
-        end = windows.starts[bisect_right(windows.firsts, high)]
-        lit = (windows.centre[begin:end] - index).abs_().neg_().add_(half + 0.5).clamp_(0.0, 1.0)
-        line = self.grey.new_zeros(self.count)
-        line.index_add_(0, self._line(windows.at[begin:end]), lit * self.grey[begin:end])
-        radius = len(self.taps) // 2
-        self.lines[index] = conv1d(line[None, None], self.taps[None, None], padding=radius)[0, 0]
-        self.lines.pop(index - windows.size, None)
-
-    def around(self, first: int, at: Tensor) -> Float[Tensor, "frames P"]:
-        """Of the frames of a window, at some pixels; nothing where there was no frame."""
-        dark = self.grey.new_zeros(self.count)
-        lines = torch.stack([self.lines.get(first + i, dark) for i in range(self.windows.size)])
-        return lines[:, self._line(at)]
-
-    def _line(self, at: Tensor) -> Tensor:
-        return at.div(self.width, rounding_mode="floor") if self.along_x else at.remainder(self.width)
-
-
-def _relative(light: Tensor, own: Tensor) -> Tensor:
-    """Over its mean in the pixel's own frames; bounded, since a faint row says little."""
-    light = (light / (FULL_LIGHT * light.amax(0)).clamp(min=1e-12)).clamp(max=1.0)
-    mean = (light * own).sum(0) / own.sum(0).clamp(min=1)
-    return (light / mean.clamp(min=1e-12)).clamp(max=4.0)

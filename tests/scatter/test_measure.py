@@ -3,8 +3,15 @@ import dataclasses
 import pytest
 import torch
 
+from reflectsep.calibrate.stack import calibrate_stack
+from reflectsep.config import FitSettings, ObjectSettings, ScatterSettings, SimulateJob
 from reflectsep.errors import SettingsError, SweepError
 from reflectsep.flags import Flag
+from reflectsep.io.capture import load_capture
+from reflectsep.io.exr import read_channels
+from reflectsep.jobs import run_simulate
+from reflectsep.pipeline import measure
+from reflectsep.progress import silent
 from reflectsep.scatter import ScatterOptions, gains, measure_scattering
 from reflectsep.scatter.filling import FILLINGS
 from reflectsep.scatter.options import HeldSweeps
@@ -16,9 +23,7 @@ def has(result, flag):
     return (result.flags & int(flag)) != 0
 
 
-@pytest.mark.parametrize(
-    ("filling", "limit"), [("profile", 0.10), ("time", 0.15), ("maximum", 0.10), ("interpolation", 0.15)]
-)
+@pytest.mark.parametrize(("filling", "limit"), [("profile", 0.10), ("maximum", 0.10), ("interpolation", 0.15)])
 def test_scattering_of_a_translucent_disc(body, error, filling, limit):
     b = body()
     result = measure_scattering(b.stack(), b.streams(), options=ScatterOptions(hole_filling=filling))
@@ -85,7 +90,8 @@ def test_curve_is_undone_by_the_root(body, error):
     plain = measure_scattering(b.stack(), b.streams(), options=ScatterOptions(n_d=1.0))
     bent = measure_scattering(b.stack(gamma=0.5), b.streams(gamma=0.5), options=ScatterOptions(n_d=0.5))
     assert bent.n_d_source == "fixed"
-    assert error(bent.root, plain.root) < 0.05
+    # The passage is found in the frames as they are, whose peaks a curve makes flatter.
+    assert error(bent.root, plain.root) < 0.08
 
 
 def test_fixed_exponent_is_kept(body):
@@ -153,15 +159,6 @@ def test_sweeps_of_one_light_are_averaged(body):
     both = measure_scattering(b.stack(), across)
     assert torch.allclose(both.root[0], (one + other) / 2, atol=2e-3)
     assert [r.direction for r in both.sweeps] == ["x", "y", "x", "x"]
-
-
-def test_orthogonal_uses_the_other_sweep(body, error):
-    b = body()
-    across = [b.stream(0, "x"), b.stream(0, "y"), b.stream(1), b.stream(2)]
-    result = measure_scattering(b.stack(), across, options=ScatterOptions(hole_filling="orthogonal"))
-    assert error(result.root[0, 0], b.truth(0, 0.5)) < 0.15
-    lacking = [w for w in result.warnings if "the other way" in w]
-    assert len(lacking) == 2
 
 
 def test_shadow_sweep_is_the_complement(body):
@@ -336,3 +333,56 @@ def test_a_passage_goes_from_one_process_to_another_as_it_is(body):
             elif field.name != "kept":
                 assert first == second, field.name
                 assert type(first) is type(second), field.name
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """The scattering of a simulated object with what it should be: a small picture, three slab sweeps, 12 bits."""
+
+    def make(name):
+        folder = tmp_path_factory.mktemp(name) / "capture"
+        run_simulate(SimulateJob(object=ObjectSettings(name=name, preset=name, size_px=48), out=str(folder)))
+        capture = load_capture(folder)
+        stack, _ = calibrate_stack(capture)
+        found = measure(capture, stack, FitSettings(), ScatterSettings(), silent)
+        planes = [read_channels(folder / "truth" / f"{light}.exr") for light in stack.names[:3]]
+        truth = torch.stack([torch.as_tensor(plane["scattering_beyond_1px.Y"]) for plane in planes])
+        mean = stack.images.mean((0, 1))
+        return stack, found, truth, stack.mask & (mean > 0.08 * stack.images.amax())
+
+    return make
+
+
+def test_wax_scatters_what_it_should_without_stripes(simulated, error):
+    _, found, truth, inner = simulated("wax")
+    measured = found.root[:3, 0]
+    for k in range(3):
+        assert error(measured[k][inner], truth[k][inner]) < 0.05
+    # Second differences tell stripes: along the sweep's axis no more than along the slab.
+    away = (measured - truth) * inner
+    square = {}
+    for axis in (-1, -2):
+        bend = away.roll(1, axis) - 2 * away + away.roll(-1, axis)
+        inside = inner & inner.roll(2, axis) & inner.roll(-2, axis)
+        square[axis] = float(bend[:, inside].square().mean())
+    assert square[-1] < 4.0 * square[-2]
+    # What is claimed is about what is wrong.
+    spread = ((measured - truth) / found.root_sd[:3, 0])[:, inner].square().mean().sqrt()
+    assert 0.3 < float(spread) < 2.0
+
+
+def test_opaque_plastic_scatters_nothing(simulated, error):
+    stack, found, _, inner = simulated("plastic")
+    for k in range(3):
+        assert float(found.root[k, 0][inner].norm() / stack.images[k, 0][inner].norm()) < 0.005
+
+
+@pytest.mark.parametrize("width_px", [2.0, 2.6, 3.0])
+def test_scattering_beyond_a_pixel_by_slabs_of_any_width(body, error, width_px):
+    b = body(width_px=width_px)
+    result = measure_scattering(b.stack(), b.streams())
+    # Of pixels a pixel apart half of the light wanders farther than a pixel.
+    share = (b.r - 0.5).clamp(0, 1)
+    for k in range(3):
+        far = ((b.transport * share) @ b.entering(k).flatten()).view_as(b.x) * b.mask
+        assert error(result.root[k, 0], far.float()) < 0.08

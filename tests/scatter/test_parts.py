@@ -1,6 +1,3 @@
-import math
-from dataclasses import replace
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -9,10 +6,11 @@ from hypothesis import strategies as st
 from reflectsep.data import PhotometricStack
 from reflectsep.scatter import geometry
 from reflectsep.scatter.exponent import GRID, Samples, solve_exponent
-from reflectsep.scatter.filling import fill_along_time, fill_by_interpolation, fill_by_maximum
+from reflectsep.scatter.filling import fill_by_interpolation, fill_by_maximum
 from reflectsep.scatter.frames import signed_root, steps
-from reflectsep.scatter.kernel import Slab, _weights, beyond, fill_by_profile, line_response
-from reflectsep.scatter.windows import Profiles
+from reflectsep.scatter.kernel import spread, strip
+from reflectsep.scatter.spread import _undarkened, point_sampled
+from reflectsep.scatter.width_fit import line_response
 from reflectsep.solve.nonnegative import nonnegative_least_squares
 
 
@@ -47,16 +45,6 @@ def test_normals_some_pixels_at_a_time_are_those_of_all(monkeypatch, at_once):
     assert (whole[~mask] == torch.tensor([0.0, 0.0, 1.0])).all()
 
 
-def test_beyond_is_the_integral_of_the_radial_spread():
-    # int_d^inf K_0(r) r dr over int_0^inf, by sums.
-    r = torch.arange(5e-4, 40, 1e-3, dtype=torch.float64)
-    density = torch.special.modified_bessel_k0(r) * r
-    for d in (0.3, 1.0, 2.5):
-        expected = float(density[r > d].sum() / density.sum())
-        assert float(beyond(d, torch.ones(1, dtype=torch.float64))) == pytest.approx(expected, abs=1e-3)
-    assert float(beyond(0.0, torch.ones(1))) == pytest.approx(1.0, abs=1e-3)
-
-
 @settings(deadline=None)
 @given(st.floats(0.5, 3), st.floats(0.3, 2), st.floats(-0.5, 0.5))
 def test_line_response_is_the_slab_on_the_line_spread(half, scale, shift):
@@ -81,68 +69,6 @@ def test_nonnegative_least_squares_is_optimal():
     # Karush-Kuhn-Tucker: no slope where free, none downhill where held.
     assert float((gradient * x).abs().max()) < 1e-6
     assert float(gradient.min()) > -1e-6
-
-
-def profiles(root, u, half):
-    hole = u.abs() <= half
-    flat = {"present": torch.ones_like(hole), "saturated": torch.zeros_like(hole)[:, None]}
-    return Profiles(
-        root=root[:, None],
-        offset=u,
-        hole=hole,
-        lit=hole.any(0),
-        light=torch.ones_like(u),
-        at=torch.arange(u.shape[1]),
-        **flat,
-    )
-
-
-def test_a_dark_channel_fills_with_next_to_nothing():
-    # A value of exactly 0 in the one frame that is surely lit; everything else is noise.
-    noise = 3e-4
-    u = torch.arange(-11.0, 12.0)[:, None] + torch.linspace(-0.45, 0.45, 50)
-    g = torch.Generator().manual_seed(4)
-    root = noise * torch.randn(u.shape, generator=g).clamp_min(0.0)
-    root[10:13] = 0.0
-    p = profiles(root, u, 1.3)
-    light = torch.cat([torch.full((11,), 1.0), 0.5 ** torch.arange(12.0).square()])[:, None].expand_as(u)
-    slab = Slab(half=1.0, edge=0.6, frames_per_px=0.5)
-    filled = fill_by_profile(replace(p, light=light), slab, distance_px=1.0, noise=noise)
-    assert float(filled.abs().max()) < 10 * noise
-
-
-def test_profile_recovers_its_own_model():
-    u = torch.arange(-12.0, 13.0)[:, None] + torch.linspace(-0.5, 0.5, 11)
-    s = torch.tensor([0.7, 1.4])
-    slab = Slab(half=1.0, edge=0.2, frames_per_px=0.5)
-    response = line_response(u, slab.half, s)
-    amplitude = torch.tensor([0.02, 0.05, 0.03, 0.04])
-    scattering = (response * amplitude[:, None]).sum(1)
-    root = scattering + 0.3 * (u.abs() <= slab.half)
-    p = profiles(root, u, slab.half + slab.edge)
-    far = beyond(0.5, s).repeat(2)
-    expected = 2 * slab.half * (amplitude * far).sum()
-    total = p.root.sum(0) - p.unsound + fill_by_profile(p, slab, distance_px=1.0, noise=0.0)
-    assert torch.allclose(total, expected.expand_as(total), rtol=0.06)
-
-
-def test_lit_frames_that_are_dark_to_the_last_digit_weigh_no_more_than_others():
-    """A 12-bit camera with its black clipped, in a shadow: weights of 1e12 left no number in single precision."""
-    value = torch.zeros(9, 2)
-    value[1, 0], value[:, 1] = 0.0012, torch.linspace(0.1, 0.9, 9)
-    measured, plateau = torch.ones_like(value, dtype=torch.bool), torch.zeros_like(value, dtype=torch.bool)
-    measured[4], plateau[4] = False, True
-    weight, lit, size = _weights(value, measured, plateau, 3e-4)
-    assert torch.equal(lit[4], weight[4])
-    assert bool((weight <= 1.0001 / (0.02 * size) ** 2).all())
-    assert float(lit[4, 1]) == pytest.approx(1 / 0.5**2)
-
-
-def test_time_fills_a_line_exactly():
-    u = torch.arange(-6.0, 7.0)[:, None].expand(13, 3)
-    root = 2.0 + 0.25 * u + 100.0 * (u.abs() <= 1.5)
-    p = profiles(root, u, 1.5)
-    assert torch.allclose(fill_along_time(p), torch.full((1, 3), 6.0))
 
 
 def test_spatial_fillings():
@@ -200,12 +126,32 @@ def test_lost_frames_lie_between_their_neighbours(body):
         assert (walked[i].values <= high + 1e-7).all()
 
 
-def test_scales_grow_with_the_slab():
-    from reflectsep.scatter.kernel import scales
+@settings(deadline=None)
+@given(st.floats(0.5, 4), st.floats(0.0, 5))
+def test_strip_is_all_that_the_spread_sends_from_beyond_a_line(scale, distance):
+    across = torch.arange(distance + 0.01, distance + 14 * scale, 0.02, dtype=torch.float64)
+    along = torch.arange(-14 * scale, 14 * scale, 0.05, dtype=torch.float64)
+    r = torch.hypot(across[:, None], along)
+    expected = float(spread(r, scale).sum() * 0.02 * 0.05)
+    assert float(strip(torch.tensor(distance), scale)) == pytest.approx(expected, abs=2e-3)
 
-    thin, wide = (
-        scales(Slab(half=0.5, edge=0.1, frames_per_px=0.5)),
-        scales(Slab(half=4.0, edge=0.1, frames_per_px=0.5)),
-    )
-    assert float(thin[0]) == float(wide[0])
-    assert math.log2(float(wide[-1] / thin[-1])) == pytest.approx(2.0)
+
+@pytest.mark.parametrize("points", [True, False])
+def test_a_camera_that_samples_points_is_told_by_divided_pixels(points):
+    g = torch.Generator().manual_seed(1)
+    centre, wide, half = 8 + 4 * torch.rand(500, generator=g), torch.full((500,), 0.5), 1.0
+    index = torch.arange(20)
+    away = (index[:, None] - centre).abs()
+    lit = (away <= half).float() if points else ((half - away) / wide + 0.5).clamp(0, 1)
+    value = 0.1 + lit + 0.02 * torch.rand(lit.shape, generator=g)
+    assert point_sampled([(value, index, centre, wide, half)]) == points
+
+
+@pytest.mark.parametrize("signal", [0.0, 0.5, 3.0])
+def test_noise_that_was_clipped_at_black_adds_nothing(signal):
+    g = torch.Generator().manual_seed(5)
+    frames, deviation = 60, 1e-3
+    clipped = (signal * deviation + deviation * torch.randn(frames, 40, 50, generator=g)).clamp(min=0.0)
+    dark = deviation / (2 * torch.pi) ** 0.5
+    found = _undarkened(clipped.sum(0), frames, dark) / frames
+    assert float(found.mean()) == pytest.approx(signal * deviation, abs=0.1 * deviation)

