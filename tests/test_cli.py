@@ -107,7 +107,8 @@ def test_a_run_leaves_nothing_of_its_own(ran, tmp_path):
         ("fit objct=wax", "objct: no such setting; did you mean object?"),
         (
             "fit object=wux",
-            "object=wux: no such option; did you mean wax? (one of generic, marble, plastic, pudding, skin, wax)",
+            "object=wux: no such option; did you mean wax? "
+            "(one of generic, marble, plastic, pudding, skin, turtle, wax)",
         ),
         ("fit object=wax fit.n_s=abc", "fit.n_s=abc: expected a number or null"),
         ("fit object=wax fit.max_iterations=1.5", "fit.max_iterations=1.5: expected a whole number"),

@@ -6,7 +6,9 @@ heldout.json  heldout/L7.exr         truth/L1.exr (channels specular.Y, ...)  tr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -28,6 +30,8 @@ from reflectsep.synth.rig import SimulatedRig
 
 Progress = Callable[[str, int, int], None]
 """Told (stage, done, total)."""
+WRITERS = 2
+"""Threads that add noise to frames and store them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,16 +109,31 @@ def write_capture(
     if rig.drift.any:
         write_json(folder / "truth" / "drift.json", {name: at.document() for name, at in poses.items()})
     total = sum(pictures.frame_counts)
-    for done, frame in enumerate(frames):
+
+    def take(frame: SimulatedFrame) -> None:
         place = frame_folder(*rig.sweeps[frame.sweep])
         name = f"{place}/{frame.index:04d}"
         time = 2.0 * frame.index / max(1, pictures.frame_counts[frame.sweep] - 1) - 1.0
         seen = moved(frame.values, poses[place].at(time), fine)
         picture = exposed(camera, seen, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
+
+    for done, _ in enumerate(beside(take, frames)):
         if progress:
             progress("frames", done + 1, total)
     return write_manifest(folder, _manifest(folder, rig, pictures))
+
+
+def beside(take: Callable[[SimulatedFrame], None], frames: Iterable[SimulatedFrame]) -> Iterator[None]:
+    """Take frames in threads, a few at a time, while the next ones are made; yields once for each, in their order."""
+    with ThreadPoolExecutor(WRITERS) as pool:
+        waiting: deque[Future[None]] = deque()
+        for frame in frames:
+            waiting.append(pool.submit(take, frame))
+            if len(waiting) > 2 * WRITERS:
+                yield waiting.popleft().result()
+        for taken in waiting:
+            yield taken.result()
 
 
 def poses_of(rig: SimulatedRig, size: tuple[int, int], seed: int) -> dict[str, Pose]:
