@@ -21,7 +21,7 @@ from reflectsep.io.stack import windowed
 from reflectsep.relight import LightMix, alphas_for, place_of
 from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
 from reflectsep.report.metrics import psnr, relative_rms
-from reflectsep.report.showcase import Apart, write_showcase
+from reflectsep.report.showcase import Apart, showcase_figure, write_figure
 from reflectsep.separation import Separation
 
 WEAK = 150.0
@@ -70,8 +70,7 @@ def show_result(ours: Separation, baseline: Separation, capture: Capture, out: P
     known = torch.nn.functional.normalize(ours.light_vectors.double(), dim=-1)
     inside = [name for name in relit if "between" in relit[name].place] or list(relit)
     chosen = min(inside, key=lambda name: float((known @ known.new_tensor(towards[name])).max()))
-    write_showcase(
-        out,
+    figure = showcase_figure(
         apart_of(ours),
         Apart(
             photograph=apart_of(ours).photograph,
@@ -87,6 +86,7 @@ def show_result(ours: Separation, baseline: Separation, capture: Capture, out: P
         directions=(capture.lights[ours.basis[0]].direction or (0.0, 0.0, 1.0), towards[chosen]),
         words=f"{len(ours.names)} lights, {len(capture.sweeps)} of them\nswept by a slab",
     )
+    write_figure(out, figure)
     return "\n".join([str(out), *compared_lines(ours, baseline, capture, list(relit.values()))])
 
 

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from reflectsep.data import Vector
-from reflectsep.io.files import atomic_write
+from reflectsep.io.pictures import write_picture
 from reflectsep.report.figures import HeldOut, object_slices
 from reflectsep.report.metrics import psnr, relative_rms
 from reflectsep.report.tone import tone, white_point
@@ -60,10 +60,12 @@ class _Panel:
     """Drawn as a dot in a ring: where the light stands, seen from the camera."""
 
 
-def write_showcase(path: Path | str, *args: object, **rest: object) -> None:
-    """Draw `showcase_figure` into a `.png`, atomically."""
-    canvas = FigureCanvasAgg(showcase_figure(*args, **rest))  # pyright: ignore[reportArgumentType]
-    atomic_write(path, lambda temporary: canvas.print_png(str(temporary)))
+def write_figure(path: Path | str, figure: Figure) -> None:
+    """Draw a figure into a `.png` of three channels, atomically."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+    write_picture(path, torch.from_numpy(pixels.copy()).permute(2, 0, 1))
 
 
 def showcase_figure(
