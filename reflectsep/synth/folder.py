@@ -6,9 +6,7 @@ heldout.json  heldout/L7.exr         truth/L1.exr (channels specular.Y, ...)  tr
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +17,7 @@ from torch import Tensor
 
 from reflectsep.data import Capture, Encoding, Light, Picture, Sweep
 from reflectsep.errors import SettingsError
+from reflectsep.io.ahead import in_order, lead_for
 from reflectsep.io.capture import write_manifest
 from reflectsep.io.exr import write_channels
 from reflectsep.io.files import write_json
@@ -30,8 +29,6 @@ from reflectsep.synth.rig import SimulatedRig
 
 Progress = Callable[[str, int, int], None]
 """Told (stage, done, total)."""
-WRITERS = 2
-"""Threads that add noise to frames and store them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,22 +115,10 @@ def write_capture(
         picture = exposed(camera, seen, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
 
-    for done, _ in enumerate(beside(take, frames)):
+    for done, _ in enumerate(in_order(take, frames, lead_for(pictures.mask.numel() * shape[0] * 8))):
         if progress:
             progress("frames", done + 1, total)
     return write_manifest(folder, _manifest(folder, rig, pictures))
-
-
-def beside(take: Callable[[SimulatedFrame], None], frames: Iterable[SimulatedFrame]) -> Iterator[None]:
-    """Take frames in threads, a few at a time, while the next ones are made; yields once for each, in their order."""
-    with ThreadPoolExecutor(WRITERS) as pool:
-        waiting: deque[Future[None]] = deque()
-        for frame in frames:
-            waiting.append(pool.submit(take, frame))
-            if len(waiting) > 2 * WRITERS:
-                yield waiting.popleft().result()
-        for taken in waiting:
-            yield taken.result()
 
 
 def poses_of(rig: SimulatedRig, size: tuple[int, int], seed: int) -> dict[str, Pose]:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from reflectsep.data import Light, Vector
 from reflectsep.errors import SettingsError
+from reflectsep.io.ahead import in_order, lead_for, one_thread
 from reflectsep.io.files import atomic_folder, write_json
 from reflectsep.synth.folder import Progress, SimulatedFrame, SimulatedPictures, write_capture, write_geometry
 from reflectsep.synth.objects import SimulatedObject
@@ -78,7 +79,7 @@ def simulate(
     """
     lights = (*rig.lights, *rig.heldout)
     scattering = transport(obj, distance)
-    with atomic_folder(out, overwrite) as folder:
+    with one_thread(), atomic_folder(out, overwrite) as folder:
         lit = _light_up(obj, scattering, lights, progress)
         slabs = [_lit_by_slab(obj, rig, name, axis) for name, axis in rig.sweeps]
         pictures, scale = _pictures(obj, rig, scattering, lit, [len(slab) for slab in slabs], progress)
@@ -119,8 +120,10 @@ def _light_up(
     obj: SimulatedObject, scattering: Transport, lights: tuple[Light, ...], progress: Progress | None
 ) -> dict[str, Illuminated]:
     lit = {}
-    for index, light in enumerate(lights):
-        lit[light.name] = illuminate(obj, scattering, light)
+    lead = lead_for(8 * 20 * obj.mask.numel())
+    found = in_order(lambda light: illuminate(obj, scattering, light), lights, lead)
+    for index, (light, illuminated) in enumerate(zip(lights, found, strict=True)):
+        lit[light.name] = illuminated
         if progress:
             progress("lights", index + 1, len(lights))
     return lit

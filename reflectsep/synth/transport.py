@@ -26,6 +26,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from reflectsep.io.ahead import in_order, lead_for
 from reflectsep.synth.kernels import Kernel
 from reflectsep.synth.objects import SimulatedObject
 from reflectsep.synth.shading import albedo_of, fresnel, per_patch
@@ -92,11 +93,18 @@ class Transport:
         # Each column in one piece: they are written, and read, one at a time.
         result = irradiance.new_zeros(self.albedo.shape[0], columns, count).mT
         steps = list(self._steps(irradiance, beyond_px))
-        for index, step in enumerate(steps):
-            step(result)
+        # Each writes values of its own, so threads may share them.
+        for index, _ in enumerate(in_order(lambda step: step(result), steps, lead_for(self._step_bytes))):
             if done:
                 done(index + 1, len(steps))
         return result
+
+    @property
+    def _step_bytes(self) -> int:
+        """Memory that a step takes, roughly."""
+        if self.distance == "chord":
+            return 3 * 8 * BLOCK_ELEMENTS
+        return 3 * 8 * len(self.albedo) * 4 * self.obj.mask.numel()
 
     def self_share(self) -> Float[Tensor, "channels patches"]:
         """Share of the light that enters a patch and leaves that same patch, albedo included, 0..1."""
