@@ -466,10 +466,10 @@ class CalibrateJob:
 
 @dataclass(kw_only=True)
 class DemoJob:
-    """Simulate, fit, relight and compare a small object, to see the whole thing."""
+    """Simulate an object, separate and relight it, and show it beside the truth, to see the whole thing."""
 
     key: ClassVar[str] = ""
-    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="wax"))
+    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="turtle", preset="turtle", channels=3))
     rig: RigSettings = field(default_factory=RigSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     scatter: ScatterSettings = field(default_factory=ScatterSettings)

@@ -29,8 +29,8 @@ from reflectsep.synth.transport import Transport, transmitted, transport
 BEYOND_PX = (1, 2)
 COLUMNS = {"chord": 1024, "plane": 32}
 """Frames transported at a time: by chord the cost is the kernel, shared by all; by plane it is each frame's own."""
-FRAMES = {"chord": torch.float64, "plane": torch.float32}
-"""Arithmetic of the frames: those of large objects are of 24 bits, beyond what any camera stores."""
+KIND = {"chord": torch.float64, "plane": torch.float32}
+"""Arithmetic of the transport: that of large objects is of 24 bits, beyond what any camera stores."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,7 +168,7 @@ def _wandering(
     scattering: Transport, lit: Mapping[str, Illuminated], oversample: int, progress: Progress | None
 ) -> dict[str, dict[str, Float[Tensor, "channels patches"]]]:
     """Scattering of every light: all of it, and that beyond each of `BEYOND_PX`."""
-    columns = torch.stack([light.entering for light in lit.values()]).mT
+    columns = torch.stack([light.entering for light in lit.values()]).to(KIND[scattering.distance]).mT
     keys = {"scattering": 0, **{f"scattering_beyond_{px}px": px for px in BEYOND_PX}}
     result = {}
     for index, (key, px) in enumerate(keys.items()):
@@ -198,7 +198,7 @@ def _frames(
 ) -> Iterator[SimulatedFrame]:
     """Every frame of every sweep, noise-free; transported in batches that bound the memory."""
     jobs = [(sweep, index) for sweep, slab in enumerate(slabs) for index in range(len(slab))]
-    size, kind = COLUMNS[scattering.distance], FRAMES[scattering.distance]
+    size, kind = COLUMNS[scattering.distance], KIND[scattering.distance]
     lights = [lit[name] for name, _ in rig.sweeps]
     entering, direct = (
         [light.entering.to(kind) for light in lights],
