@@ -62,10 +62,15 @@ def exposed(
 
 def electrons(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Numbers of electrons, Poisson about their mean; by the normal law from `MANY_E`, where it is nearly the same."""
-    counts = mean + np.sqrt(mean) * rng.standard_normal(mean.shape, dtype=np.float32)
-    few = (mean > 0) & (mean < MANY_E)
-    counts[few] = rng.poisson(mean[few])
-    return counts
+    lit = mean > 0
+    counts = mean[lit]
+    few = counts < MANY_E
+    drawn = rng.poisson(counts[few])
+    counts += np.sqrt(counts) * rng.standard_normal(counts.shape, dtype=np.float32)
+    counts[few] = drawn
+    result = np.zeros_like(mean)
+    result[lit] = counts
+    return result
 
 
 def clipped(camera: SimulatedCamera, values: np.ndarray) -> np.ndarray:
