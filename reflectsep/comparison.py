@@ -68,7 +68,8 @@ def show_result(ours: Separation, baseline: Separation, capture: Capture, out: P
     listed = read_lights(capture.folder / "heldout.json")
     towards = {name: listed[name].direction or (0.0, 0.0, 1.0) for name in relit}
     known = torch.nn.functional.normalize(ours.light_vectors.double(), dim=-1)
-    inside = [name for name in relit if "between" in relit[name].place] or list(relit)
+    mixes = alphas_for([listed[name] for name in relit], ours.light_vectors)
+    inside = [name for name in relit if min(mixes[name].alpha) >= 0] or list(relit)
     chosen = min(inside, key=lambda name: float((known @ known.new_tensor(towards[name])).max()))
     figure = showcase_figure(
         apart_of(ours),

@@ -11,7 +11,7 @@ import pytest
 
 import reflectsep
 from reflectsep.cli import main
-from reflectsep.config import JOBS, FitJob, InfoJob, RelightJob, SimulateJob
+from reflectsep.config import JOBS, DemoJob, FitJob, InfoJob, RelightJob, SimulateJob
 from reflectsep.errors import CaptureError
 
 STAND_IN = """
@@ -85,6 +85,17 @@ def test_lists_reach_the_job_with_their_types(ran):
     assert isinstance(relight, RelightJob)
     assert relight.direction == [0.0, 1.0, 2.5]
     assert fit.heldout == ["L7", "8"]
+
+
+def test_the_demo_is_in_colour_by_a_camera_like_a_real_one(ran):
+    assert main(["demo", "object.size_px=64"]) == 0
+    (job,) = ran
+    assert isinstance(job, DemoJob)
+    assert (job.object.preset, job.object.channels, job.object.size_px) == ("turtle", 3, 64)
+    assert job.rig.oversample == 2
+    assert job.rig.bits == 12
+    # Noise clipped at zero would add up over the frames of a sweep.
+    assert job.rig.dark_level > 10 * job.rig.read_noise > 0
 
 
 @pytest.mark.parametrize("path", ["captures/a", "007", "a=b (1), [2]", "it's", "true", "x y\\"])
