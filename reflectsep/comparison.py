@@ -21,6 +21,7 @@ from reflectsep.io.stack import windowed
 from reflectsep.relight import LightMix, alphas_for, place_of
 from reflectsep.report.figures import ComparisonRow, HeldOut, write_comparison
 from reflectsep.report.metrics import psnr, relative_rms
+from reflectsep.report.showcase import Apart, showcase_figure, write_figure
 from reflectsep.separation import Separation
 
 WEAK = 150.0
@@ -48,7 +49,62 @@ def compare_result(
         write_comparison(out, rows, relit, mask=ours.mask, title=f"{name}: Lin & Lee's model", baseline="")
     else:
         write_comparison(out, rows, relit, mask=ours.mask, title=name)
-    lines = [str(out)]
+    return "\n".join([str(out), *compared_lines(ours, baseline, capture, relit)])
+
+
+def show_result(ours: Separation, baseline: Separation, capture: Capture, out: Path, *, still: Still) -> str:
+    """Draw the figure of `demo` for a simulated capture; returns its numbers as text.
+
+    It shows the first basis light, and of the held-out lights between the basis lights the one that is farthest from
+    all lights of the fit.
+
+    Raises:
+        CaptureError: the capture has no truth, or no held-out light.
+    """
+    truth = true_layers(capture, ours.basis[0], ours.d.shape[1])
+    relit = {light.light: light for light in beside(ours, baseline, capture, still)}
+    if not truth or not relit or ours.light_vectors is None:
+        raise CaptureError(f"{capture.folder}: has no truth/ or no heldout/ pictures; simulate makes both")
+    listed = read_lights(capture.folder / "heldout.json")
+    towards = {name: listed[name].direction or (0.0, 0.0, 1.0) for name in relit}
+    known = torch.nn.functional.normalize(ours.light_vectors.double(), dim=-1)
+    mixes = alphas_for([listed[name] for name in relit], ours.light_vectors)
+    inside = [name for name in relit if min(mixes[name].alpha) >= 0] or list(relit)
+    chosen = min(inside, key=lambda name: float((known @ known.new_tensor(towards[name])).max()))
+    figure = showcase_figure(
+        apart_of(ours),
+        Apart(
+            photograph=apart_of(ours).photograph,
+            specular=truth["specular"],
+            # What a pixel away counts as scattering; what is left of it counts as local.
+            local_diffuse=truth["local_diffuse"] + truth["scattering"] - truth["scattering_beyond_1px"],
+            scattering=truth["scattering_beyond_1px"],
+            highlight_free=truth["local_diffuse"] + truth["scattering"],
+        ),
+        apart_of(baseline),
+        relit[chosen],
+        mask=ours.mask,
+        directions=(capture.lights[ours.basis[0]].direction or (0.0, 0.0, 1.0), towards[chosen]),
+        words=f"{len(ours.names)} lights, {len(capture.sweeps)} of them\nswept by a slab",
+    )
+    write_figure(out, figure)
+    return "\n".join([str(out), *compared_lines(ours, baseline, capture, list(relit.values()))])
+
+
+def apart_of(separation: Separation) -> Apart:
+    """The picture of the first basis light, and its components."""
+    return Apart(
+        photograph=separation.highlight_free[0] + separation.specular[0],
+        specular=separation.specular[0],
+        local_diffuse=separation.local_diffuse[0],
+        scattering=separation.scattering[0],
+        highlight_free=separation.highlight_free[0],
+    )
+
+
+def compared_lines(ours: Separation, baseline: Separation, capture: Capture, relit: list[HeldOut]) -> list[str]:
+    """Numbers of every held-out light, a warning where a polynomial's mean nothing, and errors against the truth."""
+    lines = []
     for light in relit:
         mask = ours.mask if light.counts is None else ours.mask & light.counts
         model = {"Lin & Lee": light.baseline}
@@ -56,7 +112,7 @@ def compare_result(
         scores = [f"{name} {psnr(p, light.real, mask):5.1f} dB" for name, p in (methods | dict(light.others)).items()]
         said = "".join(f"; {words}" for words in (light.place, light.note) if words)
         lines.append(f"  {light.light:12s} {', '.join(scores)}{said}")
-    return "\n".join([*lines, *weak_polynomial(ours), *truth_lines(ours, baseline, capture)])
+    return [*lines, *weak_polynomial(ours), *truth_lines(ours, baseline, capture)]
 
 
 def weak_polynomial(ours: Separation) -> list[str]:
@@ -176,23 +232,9 @@ def truth_lines(ours: Separation, baseline: Separation, capture: Capture) -> lis
     """Errors of the components where the capture knows its truth."""
     errors: dict[str, list[float]] = {}
     for i, name in enumerate(ours.basis):
-        file = capture.folder / "truth" / f"{name}.exr"
-        if not file.is_file():
-            return []
-        planes = read_channels(file)
-        channels = ("Y",) if ours.d.shape[1] == 1 else ("R", "G", "B")
-
-        def truth(
-            layer: str, planes: dict = planes, channels: tuple[str, ...] = channels, file: Path = file
-        ) -> Tensor | None:
-            keys = [f"{layer}.{c}" for c in channels]
-            if keys[0] not in planes:
-                return None
-            whole = torch.stack([torch.from_numpy(planes[k]).float() for k in keys])
-            return windowed(file, capture.region, whole)[0]
-
-        specular, scattering = truth("specular"), truth("scattering_beyond_1px")
-        if specular is not None:
+        truth = true_layers(capture, name, ours.d.shape[1])
+        if "specular" in truth:
+            specular = truth["specular"]
             whole = ours.highlight_free[i] + ours.specular[i] - specular
             for key, picture, real in (
                 ("specular, ours", ours.specular[i], specular),
@@ -201,6 +243,22 @@ def truth_lines(ours: Separation, baseline: Separation, capture: Capture) -> lis
                 ("diffuse, Lin & Lee", baseline.diffuse[i], whole),
             ):
                 errors.setdefault(key, []).append(relative_rms(picture, real, ours.mask))
-        if scattering is not None and bool(ours.scattering.any()):
-            errors.setdefault("scattering", []).append(relative_rms(ours.scattering[i], scattering, ours.mask))
+        if "scattering_beyond_1px" in truth and bool(ours.scattering.any()):
+            real = truth["scattering_beyond_1px"]
+            errors.setdefault("scattering", []).append(relative_rms(ours.scattering[i], real, ours.mask))
     return [f"  error of {key:22s} {100 * sum(v) / len(v):5.1f} % of the truth" for key, v in errors.items()]
+
+
+def true_layers(capture: Capture, light: str, channels: int) -> dict[str, Float[Tensor, "channels height width"]]:
+    """Components of a light as the simulator knows them, by name; none where the capture does not know its truth."""
+    file = capture.folder / "truth" / f"{light}.exr"
+    if not file.is_file():
+        return {}
+    planes = read_channels(file)
+    names = ("Y",) if channels == 1 else ("R", "G", "B")
+    layers = {key.rsplit(".", 1)[0] for key in planes if key.endswith(f".{names[0]}")}
+    whole = {
+        layer: torch.stack([torch.from_numpy(planes[f"{layer}.{channel}"]).float() for channel in names])
+        for layer in layers
+    }
+    return {layer: windowed(file, capture.region, picture)[0] for layer, picture in whole.items()}

@@ -25,7 +25,7 @@ class ObjectSettings:
 
     key: ClassVar[str] = "object."
     name: str = setting("", "names the default folders captures/NAME and results/NAME")
-    preset: Literal["wax", "pudding", "plastic", "marble", "skin"] = setting("wax", "simulated object")
+    preset: Literal["wax", "pudding", "plastic", "marble", "skin", "turtle"] = setting("wax", "simulated object")
     size_px: int = setting(96, "width and height of the simulated pictures", at_least=16, at_most=4096)
     channels: Literal[1, 3] = setting(1, "1 for grey, 3 for colour")
     full_exposure_s: float | None = setting(
@@ -464,10 +464,10 @@ class CalibrateJob:
 
 @dataclass(kw_only=True)
 class DemoJob:
-    """Simulate, fit, relight and compare a small object, to see the whole thing."""
+    """Simulate an object, separate and relight it, and show it beside the truth, to see the whole thing."""
 
     key: ClassVar[str] = ""
-    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="wax"))
+    object: ObjectSettings = field(default_factory=lambda: ObjectSettings(name="turtle", preset="turtle", channels=3))
     rig: RigSettings = field(default_factory=RigSettings)
     fit: FitSettings = field(default_factory=FitSettings)
     scatter: ScatterSettings = field(default_factory=ScatterSettings)

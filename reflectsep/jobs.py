@@ -16,9 +16,10 @@ from reflectsep import bench, exporting, presentation, simulation
 from reflectsep import calibration as calibration_job
 from reflectsep.checking.check import check_capture
 from reflectsep.checking.display import draw, table
-from reflectsep.comparison import compare_result
+from reflectsep.comparison import compare_result, show_result
 from reflectsep.config import (
     CalibrateJob,
+    CalibrationSettings,
     CaptureAndFitJob,
     CaptureJob,
     CheckJob,
@@ -310,7 +311,7 @@ def run_calibrate(job: CalibrateJob, progress: Progress = silent) -> str:
 
 
 def run_demo(job: DemoJob, progress: Progress = silent) -> str:
-    """Simulate, fit, relight and compare a small object."""
+    """Simulate an object, separate it, relight it, and show it beside the truth and Lin & Lee's."""
     out = Path(job.out)
     refuse_existing(out, job.overwrite)
     captured, result = str(out / "capture"), str(out / "result")
@@ -322,16 +323,23 @@ def run_demo(job: DemoJob, progress: Progress = silent) -> str:
             rig=job.rig,
             fit=job.fit,
             scatter=job.scatter,
+            # A camera that is known to stand still is not looked at for drift.
+            calibration=CalibrationSettings(registration="all" if simulation.rig_of(job.rig).drift.any else "none"),
             capture=captured,
             out=result,
             overwrite=again,
+            report=False,
         ),
         progress,
     )
     heldout = str(out / "capture" / "heldout.json")
     run_relight(RelightJob(result=result, lights=heldout, out=str(out / "relit"), overwrite=again), progress)
     figure = str(out / "compare.png")
-    compared = run_compare(CompareJob(result=result, out=figure, overwrite=again), progress)
+    separation = load(result)
+    capture = opened_again(separation, captured)
+    baseline = lin_lee_beside(separation, capture, job.fit, progress)
+    capture, _, still = real_pictures(separation, capture)
+    compared = show_result(separation, baseline, capture, Path(figure), still=still)
     run_view(ViewJob(result=result, overwrite=again), progress)
-    pages = f"read {out / 'result' / 'report.html'}; move the light in {out / 'result' / 'view.html'}"
-    return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}\n{pages}"
+    page = f"move the light in {out / 'result' / 'view.html'}; reflectsep report result={result} explains the fit"
+    return f"{said}\n{compared}\nlook at {figure}; relit pictures are in {out / 'relit'}\n{page}"

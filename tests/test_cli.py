@@ -11,7 +11,7 @@ import pytest
 
 import reflectsep
 from reflectsep.cli import main
-from reflectsep.config import JOBS, FitJob, InfoJob, RelightJob, SimulateJob
+from reflectsep.config import JOBS, DemoJob, FitJob, InfoJob, RelightJob, SimulateJob
 from reflectsep.errors import CaptureError
 
 STAND_IN = """
@@ -87,6 +87,17 @@ def test_lists_reach_the_job_with_their_types(ran):
     assert fit.heldout == ["L7", "8"]
 
 
+def test_the_demo_is_in_colour_by_a_camera_like_a_real_one(ran):
+    assert main(["demo", "object.size_px=64"]) == 0
+    (job,) = ran
+    assert isinstance(job, DemoJob)
+    assert (job.object.preset, job.object.channels, job.object.size_px) == ("turtle", 3, 64)
+    assert job.rig.oversample == 2
+    assert job.rig.bits == 12
+    # Noise clipped at zero would add up over the frames of a sweep.
+    assert job.rig.dark_level > 10 * job.rig.read_noise > 0
+
+
 @pytest.mark.parametrize("path", ["captures/a", "007", "a=b (1), [2]", "it's", "true", "x y\\"])
 def test_info_takes_any_path(ran, path):
     assert main(["info", path]) == 0
@@ -107,7 +118,8 @@ def test_a_run_leaves_nothing_of_its_own(ran, tmp_path):
         ("fit objct=wax", "objct: no such setting; did you mean object?"),
         (
             "fit object=wux",
-            "object=wux: no such option; did you mean wax? (one of generic, marble, plastic, pudding, skin, wax)",
+            "object=wux: no such option; did you mean wax? "
+            "(one of generic, marble, plastic, pudding, skin, turtle, wax)",
         ),
         ("fit object=wax fit.n_s=abc", "fit.n_s=abc: expected a number or null"),
         ("fit object=wax fit.max_iterations=1.5", "fit.max_iterations=1.5: expected a whole number"),

@@ -127,7 +127,7 @@ def binned(
     """Means of blocks of `oversample` by `oversample` values."""
     if oversample == 1:
         return picture
-    return torch.nn.functional.avg_pool2d(picture[None].double(), oversample)[0].to(picture.dtype)
+    return torch.nn.functional.avg_pool2d(picture[None], oversample)[0]
 
 
 def _lagrange(place: Tensor) -> list[Tensor]:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from reflectsep.data import Capture, Encoding, Light, Picture, Sweep
 from reflectsep.errors import SettingsError
+from reflectsep.io.ahead import in_order, lead_for
 from reflectsep.io.capture import write_manifest
 from reflectsep.io.exr import write_channels
 from reflectsep.io.files import write_json
@@ -105,13 +106,16 @@ def write_capture(
     if rig.drift.any:
         write_json(folder / "truth" / "drift.json", {name: at.document() for name, at in poses.items()})
     total = sum(pictures.frame_counts)
-    for done, frame in enumerate(frames):
+
+    def take(frame: SimulatedFrame) -> None:
         place = frame_folder(*rig.sweeps[frame.sweep])
         name = f"{place}/{frame.index:04d}"
         time = 2.0 * frame.index / max(1, pictures.frame_counts[frame.sweep] - 1) - 1.0
         seen = moved(frame.values, poses[place].at(time), fine)
         picture = exposed(camera, seen, camera.slab_exposure_s, sigma=camera.frame_sigma, rng=noise(seed, name))
         _store(rig, folder, name, picture)
+
+    for done, _ in enumerate(in_order(take, frames, lead_for(pictures.mask.numel() * shape[0] * 8))):
         if progress:
             progress("frames", done + 1, total)
     return write_manifest(folder, _manifest(folder, rig, pictures))

@@ -1,4 +1,4 @@
-"""The simulated objects that come with the package: wax, pudding, plastic, marble and skin."""
+"""The simulated objects that come with the package: wax, pudding, plastic, marble, skin and a turtle."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from reflectsep.errors import SettingsError
 from reflectsep.synth.kernels import DipoleKernel, ExponentialKernel, Kernel
 from reflectsep.synth.objects import HeightFunction, Material, SimulatedObject, from_height, in_channels
+from reflectsep.synth.turtle import in_eye, on_shell, stain, turtle_height
 
 Colour = tuple[float, float, float]
 
@@ -147,12 +148,39 @@ def pudding(size: int, channels: int, seed: int) -> SimulatedObject:
     )
 
 
+def turtle(size: int, channels: int, seed: int) -> SimulatedObject:  # noqa: ARG001  (presets are called alike)
+    """A carved turtle: soft green wax with fine grains, an amber shell under a sharp glaze, black eyes."""
+    kernels = _exponentials(size, (0.55, 0.45), ((0.014, 0.042), (0.011, 0.030), (0.008, 0.020)))
+    skin = _material(
+        "wax", channels, diffuse=(0.10, 0.17, 0.09), scattering=(0.42, 0.66, 0.38), kernels=kernels, roughness=0.35,
+    )  # fmt: skip
+    shell = _material(
+        "glaze", channels, diffuse=(0.16, 0.085, 0.03), scattering=(0.78, 0.50, 0.20), kernels=kernels,
+        roughness=0.12, ior=1.55,
+    )  # fmt: skip
+    eye = _material(
+        "eye", channels, diffuse=(0.012, 0.010, 0.010), scattering=(0.02, 0.02, 0.02), kernels=kernels,
+        roughness=0.12, ior=1.55,
+    )  # fmt: skip
+    # The stain takes blue first and red last, as varnish does.
+    depth = torch.tensor([1.0, 1.9, 2.5] if channels == 3 else [1.8], dtype=torch.float64)[:, None, None]
+    return from_height(
+        "turtle",
+        lambda x, y: size * turtle_height(x / size, y / size),
+        size=(size, size),
+        materials=(skin, shell, eye),
+        paint=lambda x, y: torch.where(in_eye(x / size, y / size), 2, on_shell(x / size, y / size).to(torch.int64)),
+        tint=lambda x, y: torch.exp(-depth * stain(x / size, y / size)),
+    )
+
+
 OBJECTS: dict[str, Callable[[int, int, int], SimulatedObject]] = {
     "wax": wax,
     "pudding": pudding,
     "plastic": plastic,
     "marble": marble,
     "skin": skin,
+    "turtle": turtle,
 }
 """Every preset by name: (size, channels, seed) -> object."""
 

@@ -19,6 +19,8 @@ VIEW = (0.0, 0.0, 1.0)
 SHADOW_STEP_PX = 0.5
 PENUMBRA_PX = 0.5
 """Overhang at which a shadow is full; softens its edge to about a pixel."""
+PRUNING = 8
+"""Samples along a ray after which rays that have left the object are dropped."""
 
 
 def fresnel(cosine: Float[Tensor, "*p"], ior: Float[Tensor, "*p"]) -> Float[Tensor, "*p"]:
@@ -41,7 +43,7 @@ def visibility(
         step_px: Distance between samples along the ray, in the picture plane.
     """
     points, facing = obj.points, obj.patch_normals @ light > 0
-    free = torch.ones(len(points), dtype=torch.float64)
+    free = facing.to(torch.float64)
     slant = float(light[:2].norm())
     if slant > 1e-9 and float(light[2]) > 0:
         rise = float(light[2]) / slant
@@ -51,11 +53,15 @@ def visibility(
         field = torch.where(obj.mask, obj.z, floor)[None, None]
         reach = min(float(heights.max() - floor) / rise, math.hypot(*obj.size)) + step_px
         towards = light[:2] / slant
+        below = facing.nonzero()[:, 0]
         for sample in range(2, int(reach / step_px) + 2):
             away = sample * step_px
-            overhang = _sampled(field, points[:, :2] + away * towards) - (points[:, 2] + away * rise)
-            free = torch.minimum(free, 1 - (overhang / PENUMBRA_PX).clamp(0, 1))
-    return torch.where(facing, free, 0.0)
+            if sample % PRUNING == 0:  # a ray above the highest point meets nothing any more
+                below = below[points[below, 2] + away * rise < heights.max()]
+            here = points[below]
+            overhang = _sampled(field, here[:, :2] + away * towards) - (here[:, 2] + away * rise)
+            free[below] = torch.minimum(free[below], 1 - (overhang / PENUMBRA_PX).clamp(0, 1))
+    return free
 
 
 def irradiance(obj: SimulatedObject, light: Float[Tensor, "3"]) -> Float[Tensor, "patches"]:
@@ -70,7 +76,7 @@ def local_diffuse(obj: SimulatedObject, light: Float[Tensor, "3"]) -> Float[Tens
     """
     normals = obj.patch_normals
     cos_in, cos_out = (normals @ light).clamp(1e-6, 1), normals[:, 2].clamp(1e-6, 1)
-    albedo = per_patch(obj, [material.diffuse for material in obj.materials]).mT
+    albedo = albedo_of(obj, [material.diffuse for material in obj.materials])
     sigma = per_patch(obj, [math.radians(material.diffuse_roughness_deg) for material in obj.materials]).square()
     ior = per_patch(obj, [material.ior for material in obj.materials])
     a, b = 1 - 0.5 * sigma / (sigma + 0.33), 0.45 * sigma / (sigma + 0.09)
@@ -107,6 +113,12 @@ def specular(obj: SimulatedObject, light: Float[Tensor, "3"]) -> Float[Tensor, "
 def per_patch(obj: SimulatedObject, values: list[float] | list[tuple[float, ...]]) -> Float[Tensor, "patches ..."]:
     """Values given by material, at every patch."""
     return torch.tensor(values, dtype=torch.float64)[obj.patch_material]
+
+
+def albedo_of(obj: SimulatedObject, albedos: list[tuple[float, ...]]) -> Float[Tensor, "channels patches"]:
+    """Albedos given by material, at every patch, times the object's tint there."""
+    plain = per_patch(obj, albedos).mT.contiguous()
+    return plain if obj.tint is None else plain * obj.tint[:, obj.mask]
 
 
 def _sampled(field: Float[Tensor, "1 1 height width"], xy: Float[Tensor, "patches 2"]) -> Float[Tensor, "patches"]:

@@ -6,7 +6,7 @@ light with its irradiance cut to the slab, so the frames of a sweep sum to (slab
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from reflectsep.data import Light, Vector
 from reflectsep.errors import SettingsError
+from reflectsep.io.ahead import in_order, lead_for, one_thread
 from reflectsep.io.files import atomic_folder, write_json
 from reflectsep.synth.folder import Progress, SimulatedFrame, SimulatedPictures, write_capture, write_geometry
 from reflectsep.synth.objects import SimulatedObject
@@ -28,6 +29,8 @@ from reflectsep.synth.transport import Transport, transmitted, transport
 BEYOND_PX = (1, 2)
 COLUMNS = {"chord": 1024, "plane": 32}
 """Frames transported at a time: by chord the cost is the kernel, shared by all; by plane it is each frame's own."""
+KIND = {"chord": torch.float64, "plane": torch.float32}
+"""Arithmetic of the transport: that of large objects is of 24 bits, beyond what any camera stores."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,10 +79,12 @@ def simulate(
     """
     lights = (*rig.lights, *rig.heldout)
     scattering = transport(obj, distance)
-    with atomic_folder(out, overwrite) as folder:
+    with one_thread(), atomic_folder(out, overwrite) as folder:
         lit = _light_up(obj, scattering, lights, progress)
-        pictures, scale = _pictures(obj, rig, scattering, lit, progress)
-        write_capture(folder, rig, pictures, _frames(obj, rig, scattering, lit, scale), seed=seed, progress=progress)
+        slabs = [_lit_by_slab(obj, rig, name, axis) for name, axis in rig.sweeps]
+        pictures, scale = _pictures(obj, rig, scattering, lit, [len(slab) for slab in slabs], progress)
+        frames = _frames(obj, rig, scattering, lit, slabs, scale)
+        write_capture(folder, rig, pictures, frames, seed=seed, progress=progress)
         write_geometry(folder / "truth" / "geometry.exr", obj, rig.camera.oversample)
         write_json(folder / "truth" / "simulation.json", _facts(obj, rig, scattering, scale, seed))
     return Path(out)
@@ -115,8 +120,10 @@ def _light_up(
     obj: SimulatedObject, scattering: Transport, lights: tuple[Light, ...], progress: Progress | None
 ) -> dict[str, Illuminated]:
     lit = {}
-    for index, light in enumerate(lights):
-        lit[light.name] = illuminate(obj, scattering, light)
+    lead = lead_for(8 * 20 * obj.mask.numel())
+    found = in_order(lambda light: illuminate(obj, scattering, light), lights, lead)
+    for index, (light, illuminated) in enumerate(zip(lights, found, strict=True)):
+        lit[light.name] = illuminated
         if progress:
             progress("lights", index + 1, len(lights))
     return lit
@@ -127,6 +134,7 @@ def _pictures(
     rig: SimulatedRig,
     scattering: Transport,
     lit: Mapping[str, Illuminated],
+    frame_counts: Sequence[int],
     progress: Progress | None,
 ) -> tuple[SimulatedPictures, float]:
     """Noise-free pictures of every light, scaled, and the scale: values per unit of radiance."""
@@ -151,7 +159,7 @@ def _pictures(
         mask=obj.mask,
         full={name: picture(patches) for name, patches in full.items()},
         components=components,
-        frame_counts=tuple(_lit_by_slab(obj, rig, name, axis).shape[1] for name, axis in rig.sweeps),
+        frame_counts=tuple(frame_counts),
     )
     return pictures, scale
 
@@ -160,7 +168,7 @@ def _wandering(
     scattering: Transport, lit: Mapping[str, Illuminated], oversample: int, progress: Progress | None
 ) -> dict[str, dict[str, Float[Tensor, "channels patches"]]]:
     """Scattering of every light: all of it, and that beyond each of `BEYOND_PX`."""
-    columns = torch.stack([light.entering for light in lit.values()], -1)
+    columns = torch.stack([light.entering for light in lit.values()]).to(KIND[scattering.distance]).mT
     keys = {"scattering": 0, **{f"scattering_beyond_{px}px": px for px in BEYOND_PX}}
     result = {}
     for index, (key, px) in enumerate(keys.items()):
@@ -173,28 +181,36 @@ def _wandering(
 
 def _lit_by_slab(
     obj: SimulatedObject, rig: SimulatedRig, light: str, axis: Literal["x", "y"]
-) -> Bool[Tensor, "patches frames"]:
+) -> Bool[Tensor, "frames patches"]:
     towards: Vector | None = rig.lights_by_name[light].direction
     assert towards is not None  # a rig has no light without one
     fine = rig.camera.oversample
-    return slab_frames(obj.points, towards, axis, rig.slab_width_px * fine, rig.slab_step_px * fine)
+    return slab_frames(obj.points, towards, axis, rig.slab_width_px * fine, rig.slab_step_px * fine).mT.contiguous()
 
 
 def _frames(
-    obj: SimulatedObject, rig: SimulatedRig, scattering: Transport, lit: Mapping[str, Illuminated], scale: float
+    obj: SimulatedObject,
+    rig: SimulatedRig,
+    scattering: Transport,
+    lit: Mapping[str, Illuminated],
+    slabs: Sequence[Bool[Tensor, "frames patches"]],
+    scale: float,
 ) -> Iterator[SimulatedFrame]:
     """Every frame of every sweep, noise-free; transported in batches that bound the memory."""
-    slabs = [_lit_by_slab(obj, rig, name, axis) for name, axis in rig.sweeps]
-    jobs = [(sweep, index) for sweep, slab in enumerate(slabs) for index in range(slab.shape[1])]
-    size = COLUMNS[scattering.distance]
+    jobs = [(sweep, index) for sweep, slab in enumerate(slabs) for index in range(len(slab))]
+    size, kind = COLUMNS[scattering.distance], KIND[scattering.distance]
+    lights = [lit[name] for name, _ in rig.sweeps]
+    entering, direct = (
+        [light.entering.to(kind) for light in lights],
+        [scale * light.direct.to(kind) for light in lights],
+    )
+    intensity = [scale * light.intensity[:, None].to(kind) for light in lights]
     for start in range(0, len(jobs), size):
         batch = jobs[start : start + size]
-        columns = [slabs[sweep][:, index] * lit[rig.sweeps[sweep][0]].entering for sweep, index in batch]
-        spread = scattering.spread(torch.stack(columns, -1))
-        for column, (sweep, index) in enumerate(batch):
-            light = lit[rig.sweeps[sweep][0]]
-            patches = slabs[sweep][:, index] * light.direct + light.intensity[:, None] * spread[..., column]
-            yield SimulatedFrame(sweep=sweep, index=index, values=obj.picture(scale * patches))
+        spread = scattering.spread(torch.stack([slabs[at][index] * entering[at] for at, index in batch]).mT)
+        for column, (at, index) in enumerate(batch):
+            patches = slabs[at][index] * direct[at] + intensity[at] * spread[..., column]
+            yield SimulatedFrame(sweep=at, index=index, values=obj.picture(patches))
 
 
 def _facts(

@@ -26,9 +26,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from reflectsep.io.ahead import in_order, lead_for
 from reflectsep.synth.kernels import Kernel
 from reflectsep.synth.objects import SimulatedObject
-from reflectsep.synth.shading import fresnel, per_patch
+from reflectsep.synth.shading import albedo_of, fresnel, per_patch
 
 MOST_CHORD_PATCHES = 12_000
 BLOCK_ELEMENTS = 4_000_000
@@ -39,7 +40,22 @@ TAIL = 9.0
 """FFT padding in lengths of the longest kernel; exp(-9) of it comes round."""
 
 Done = Callable[[int, int], None]
-Spectra = list[list[list[Tensor]]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plane:
+    """A convolution in the picture plane, over the object's bounding box."""
+
+    box: tuple[int, int]
+    size: tuple[int, int]
+    """Of the FFT."""
+    places: list[Int[Tensor, "members"]]
+    """Of each group's patches in the flattened box."""
+    entering: list[Float[Tensor, "channels members"]]
+    """Of each group: what irradiance is multiplied by on its way in, and what comes out on its way out."""
+    leaving: list[Float[Tensor, "channels members"]]
+    spectra: list[list[Tensor]]
+    """[target group][source group], (channels, height, half the width)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,15 +86,25 @@ class Transport:
             done: Told (blocks done, blocks in all).
 
         Returns:
-            Radiance, float64; 0 everywhere for an opaque object.
+            Radiance, as exact as `irradiance`: float64, or by FFT float32 (24 bits of the brightest) at half the time;
+            0 everywhere for an opaque object.
         """
-        result = irradiance.new_zeros(self.albedo.shape[0], *irradiance.shape)
+        count, columns = irradiance.shape
+        # Each column in one piece: they are written, and read, one at a time.
+        result = irradiance.new_zeros(self.albedo.shape[0], columns, count).mT
         steps = list(self._steps(irradiance, beyond_px))
-        for index, step in enumerate(steps):
-            step(result)
+        # Each writes values of its own, so threads may share them.
+        for index, _ in enumerate(in_order(lambda step: step(result), steps, lead_for(self._step_bytes))):
             if done:
                 done(index + 1, len(steps))
         return result
+
+    @property
+    def _step_bytes(self) -> int:
+        """Memory that a step takes, roughly."""
+        if self.distance == "chord":
+            return 3 * 8 * BLOCK_ELEMENTS
+        return 3 * 8 * len(self.albedo) * 4 * self.obj.mask.numel()
 
     def self_share(self) -> Float[Tensor, "channels patches"]:
         """Share of the light that enters a patch and leaves that same patch, albedo included, 0..1."""
@@ -91,9 +117,9 @@ class Transport:
     def _steps(self, columns: Tensor, beyond_px: float) -> Iterator[Callable[[Tensor], None]]:
         """Parts of the work, each adding its own to the result."""
         if self.distance == "plane" and self.members:
-            spectra = _spectra(self.obj.mask.shape, self.kernels, beyond_px)
+            plane = self._plane(columns.dtype, beyond_px)
             for column in range(columns.shape[1]):
-                yield lambda result, at=column: self._add_convolved(result, columns, at, spectra)
+                yield lambda result, at=column: self._add_convolved(result[..., at], columns[:, at], plane)
             return
         for target, to_group in enumerate(self.members):
             rows = max(1, BLOCK_ELEMENTS // max(1, len(self.points)))
@@ -114,25 +140,35 @@ class Transport:
                 gain = (self.albedo[channel, block].sqrt() * self.out[block])[:, None]
                 result[channel, block] += gain * (kernel.mul_(share) @ (weight * columns[group]))
 
-    def _add_convolved(self, result: Tensor, columns: Tensor, at: int, spectra: Spectra) -> None:
-        """One column, by FFT in the picture plane."""
-        balance = self.area.rsqrt()
-        size = _padded(self.obj.mask.shape, self.kernels)
-        height, width = self.obj.mask.shape
-        field_of = torch.zeros(self.obj.mask.shape, dtype=columns.dtype)
-        for channel in range(result.shape[0]):
-            root = self.albedo[channel].sqrt()
-            entering = root * self.area * balance * columns[:, at]
-            fields = []
-            for group in self.members:
-                only = torch.zeros_like(entering)
-                only[group] = entering[group]
-                field_of[self.obj.mask] = only
-                fields.append(torch.fft.rfft2(field_of, s=size))
-            for target, group in enumerate(self.members):
-                total = torch.stack([f * spectra[channel][target][k] for k, f in enumerate(fields)]).sum(0)
-                leaving = torch.fft.irfft2(total, s=size)[:height, :width][self.obj.mask]
-                result[channel, group, at] += (root * balance * self.out * leaving)[group]
+    def _plane(self, dtype: torch.dtype, beyond_px: float) -> _Plane:
+        """What every column's convolution needs, over the object's bounding box."""
+        rows, columns = self.obj.mask.nonzero().mT
+        top, left = int(rows.min()), int(columns.min())
+        box = (int(rows.max()) - top + 1, int(columns.max()) - left + 1)
+        root, balance = self.albedo.sqrt(), self.area.rsqrt()
+        return _Plane(
+            box=box,
+            size=_padded(box, self.kernels),
+            places=[((rows - top) * box[1] + columns - left)[group] for group in self.members],
+            entering=[(root * self.area * balance)[:, group].to(dtype) for group in self.members],
+            leaving=[(root * balance * self.out)[:, group].to(dtype) for group in self.members],
+            spectra=_spectra(_padded(box, self.kernels), self.kernels, beyond_px, dtype),
+        )
+
+    def _add_convolved(self, result: Tensor, irradiance: Tensor, plane: _Plane) -> None:
+        """One column, (channels, patches) += (patches), by FFT in the picture plane."""
+        height, width = plane.box
+        fields = []
+        for group, places, weight in zip(self.members, plane.places, plane.entering, strict=True):
+            field_of = weight.new_zeros(len(weight), height * width)
+            field_of[:, places] = weight * irradiance[group]
+            fields.append(torch.fft.rfft2(field_of.view(-1, height, width), s=plane.size))
+        for target, group in enumerate(self.members):
+            total = fields[0] * plane.spectra[target][0]
+            for source in range(1, len(fields)):
+                total = total.addcmul_(fields[source], plane.spectra[target][source])
+            leaving = torch.fft.irfft2(total, s=plane.size)[:, :height, :width].flatten(1)
+            result[:, group] += plane.leaving[target] * leaving[:, plane.places[target]]
 
 
 def transport(obj: SimulatedObject, distance: Literal["chord", "plane"] | None = None) -> Transport:
@@ -160,7 +196,7 @@ def transport(obj: SimulatedObject, distance: Literal["chord", "plane"] | None =
         out=(1 - fresnel(cosine, ior)) / math.pi,
         members=tuple(_indices(here) for here in members.values() if bool(here.any())),
         kernels=tuple(kernels for kernels, here in members.items() if bool(here.any())),
-        albedo=per_patch(obj, [made_of.scattering for made_of in obj.materials]).mT.contiguous(),
+        albedo=albedo_of(obj, [made_of.scattering for made_of in obj.materials]),
     )
 
 
@@ -183,11 +219,11 @@ def _padded(shape: Sequence[int], kernels: tuple[tuple[Kernel, ...], ...]) -> tu
 
 
 def _fast(length: int) -> int:
-    """The next even length with no prime factor above 5."""
+    """The next even length with no prime factor above 7."""
     length += length % 2
     while True:
         rest = length
-        for prime in (2, 3, 5):
+        for prime in (2, 3, 5, 7):
             while rest % prime == 0:
                 rest //= prime
         if rest == 1:
@@ -195,15 +231,19 @@ def _fast(length: int) -> int:
         length += 2
 
 
-def _spectra(shape: Sequence[int], kernels: tuple[tuple[Kernel, ...], ...], beyond_px: float) -> Spectra:
-    """Spectrum of the kernel [channel][target group][source group]."""
-    height, width = _padded(shape, kernels)
-    down = torch.fft.fftfreq(height, 1 / height, dtype=torch.float64)
-    right = torch.fft.fftfreq(width, 1 / width, dtype=torch.float64)
+def _spectra(
+    size: tuple[int, int], kernels: tuple[tuple[Kernel, ...], ...], beyond_px: float, dtype: torch.dtype
+) -> list[list[Tensor]]:
+    """Spectrum of the kernel, real because it is even: [target group][source group], (channels, height, half width)."""
+    down, right = (torch.fft.fftfreq(length, 1 / length, dtype=torch.float64) for length in size)
     r = (down[:, None].square() + right[None].square()).sqrt()
     share = (r - (beyond_px - 0.5)).clamp(0, 1) if beyond_px > 0 else (r > 0).to(r.dtype)
-    channels = len(kernels[0])
+
+    def spectrum(ours: Kernel, theirs: Kernel) -> Tensor:
+        kernel = ours(r) if ours == theirs else (ours(r) * theirs(r)).sqrt()
+        return torch.fft.rfft2(kernel * share).real.to(dtype)
+
     return [
-        [[torch.fft.rfft2((ours[c](r) * theirs[c](r)).sqrt() * share).real for theirs in kernels] for ours in kernels]
-        for c in range(channels)
+        [torch.stack([spectrum(*pair) for pair in zip(ours, theirs, strict=True)]) for theirs in kernels]
+        for ours in kernels
     ]

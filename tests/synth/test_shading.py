@@ -54,6 +54,27 @@ def test_a_convex_body_casts_no_shadow_on_itself():
     assert visibility(dome, light)[facing].min() == 1.0
 
 
+def test_a_shadow_is_as_by_following_every_ray_to_its_end():
+    scene = from_height("tower", tower, size=(21, 21), materials=(GREY,))
+    light = torch.tensor(direction(62, 25), dtype=torch.float64)
+    right, up, rise = (float(part / light[:2].norm()) for part in light)
+    z, expected = scene.z.tolist(), []
+    for x, y, height in scene.points.tolist():
+        free = 1.0
+        for away in (0.5 * sample for sample in range(2, 60)):
+            column, row = (min(max(at, 0.0), 19.999) for at in (x + away * right + 10, 10 - y - away * up))
+            i, j, p, q = int(column), int(row), column % 1, row % 1
+            above = (1 - p) * z[j][i] + p * z[j][i + 1]
+            below = (1 - p) * z[j + 1][i] + p * z[j + 1][i + 1]
+            overhang = (1 - q) * above + q * below - height - away * rise
+            free = min(free, 1 - min(max(overhang / 0.5, 0.0), 1.0))
+        expected.append(free)
+    facing = scene.patch_normals @ light > 0
+    found = visibility(scene, light)[facing]
+    assert found == pytest.approx(torch.tensor(expected, dtype=torch.float64)[facing], abs=1e-2)
+    assert float((found < 0.5).double().mean()) > 0.03
+
+
 def test_a_lambertian_patch_is_its_albedo_less_fresnel():
     value = local_diffuse(plane(), UP) * math.pi
     expected = 0.5 * (1 - 0.04) ** 2  # ((1.5 - 1) / (1.5 + 1))^2 = 0.04

@@ -13,7 +13,7 @@ from reflectsep.synth.rig import direction
 from reflectsep.synth.shading import irradiance
 from reflectsep.synth.transport import transmitted, transport
 
-SCATTERING = ("wax", "pudding", "marble", "skin")
+SCATTERING = ("wax", "pudding", "marble", "skin", "turtle")
 DISTANCES = ("chord", "plane")
 
 
