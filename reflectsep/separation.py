@@ -6,8 +6,8 @@ in radiance. Components, for basis light k of intensity t_k:
     off-specular    t_k F(a_k + B m_k)            local diffuse   t_k (d_k)_+ ^ n_d
     scattering      t_k (s_k)_+ ^ n_d             whole diffuse   t_k (q T(d_k + s_k)) ^ n_d
 
-with F, T, q and m as in `reflectsep.model`. The whole diffuse is not quite the sum of its two parts: for n_d != 1 by the
-power, and otherwise by what T adds at the edge of a shadow and takes at grazing angles.
+with F, T, q and m as in `reflectsep.model`. The whole diffuse is not quite the sum of its two parts: for n_d != 1 by
+the power, and otherwise by what T adds at the edge of a shadow and takes at grazing angles.
 """
 
 from __future__ import annotations

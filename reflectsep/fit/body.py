@@ -48,9 +48,7 @@ def robust_body(
     return b
 
 
-def solve_weighted(
-    root: Tensor, weight: Tensor, alpha: Float[Tensor, "lights 3"]
-) -> Float[Tensor, "3 channels pixels"]:
+def solve_weighted(root: Tensor, weight: Tensor, alpha: Float[Tensor, "lights 3"]) -> Tensor:
     """argmin_b sum_j weight_j (root_j - A_j b)^2, with a trace of a ridge."""
     system = root.new_zeros(3, 3, *root.shape[1:])
     for k in range(3):

@@ -41,10 +41,10 @@ def describe(
     options: FitOptions,
 ) -> Fit:
     """The finished fit as pictures in single precision; zero outside the mask."""
-    problem, mask, shared = state.problem, state.mask, state.shared
+    problem, shared = state.problem, state.shared
     assert state.cost is not None
     assert state.status is not None
-    obs, g = problem.obs, globals_of(shared, problem.obs)
+    g = globals_of(shared, problem.obs)
     names = names_of(stack, shared)
     if options.held is None:
         covariance = shared_covariance(state, options.chunk)

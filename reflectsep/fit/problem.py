@@ -371,7 +371,9 @@ class PixelProblem:
             J[i, -1] = (slope * at.z).sum(0)
         return J
 
-    def coupled(self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> tuple[Tensor, ...]:
+    def coupled(
+        self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """V, gl, W, H and gg of every pixel."""
         at = self.normal(local, shared)
         rows = self.residuals(local, shared)
@@ -383,7 +385,7 @@ class PixelProblem:
         return at.V, at.g, W, H, (weighted * rows[:, None]).sum(0)
 
     def shared_jacobian(self, local: Float[Tensor, "P pixels"], shared: Float[Tensor, "G"]) -> Tensor:
-        """Derivatives of `residuals` by the shared unknowns (rows, G, pixels): closed forms, autograd for the alphas."""
+        """Derivatives of `residuals` by the shared unknowns (rows, G, pixels); autograd for the alphas alone."""
         at = self._slopes(local, shared)
         lights, channels, pixels = self.obs.images.shape
         count = lights * channels

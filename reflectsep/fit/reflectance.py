@@ -49,6 +49,8 @@ N_D_SD, N_D_SD_LEAST = 0.05, 0.01
 """Relative standard deviation of n_d: of 1 where no sweep tells, and the least that a sweep's is taken to have."""
 FIRST_NOISE = 0.005
 """Of the brightest values: the noise that a fit starts with; the fit itself then tells."""
+LEAST_NOISE = 1e-5
+"""The same at least: pictures without any noise would make the arithmetic stiff."""
 START_N_S = (8.0, 20.0, 60.0)
 TELLING = 400
 """Pixels that the start of the globals is fitted to: the brightest highlights."""
@@ -200,14 +202,11 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
         shared[: len(given)] = torch.where(keep, given, shared[: len(given)])
     if held is not None:
         free[:] = False
+    spread = HEIGHT_SPREAD if obs.lights_known else HEIGHT_SPREAD_BLIND
     problem = (UnknownScattering if options.scattering == "unknown" else PixelProblem)(
         obs=obs,
         sigma=FIRST_NOISE * peak if held is None else held.noise,
-        height_spread=math.inf
-        if options.prior == "none"
-        else HEIGHT_SPREAD
-        if obs.lights_known
-        else HEIGHT_SPREAD_BLIND,
+        height_spread=math.inf if options.prior == "none" else spread,
         huber=HUBER if options.robust == "huber" else None,
         priors=options.prior == "auto",
         alpha_sd=options.alpha_sd or 0.02,
@@ -273,9 +272,8 @@ def fit_globals(state: State, options: FitOptions, progress: Progress) -> State:
     smooth: Smoothness | None = None
     for i in range(ROUNDS):
         progress("globals", len(START_N_S) + i, len(START_N_S) + ROUNDS)
-        problem = replace(
-            problem, sigma=noise_of(problem, local, shared, options.chunk, 0.002 * FIRST_NOISE * state.peak)
-        )
+        least = LEAST_NOISE * state.peak
+        problem = replace(problem, sigma=noise_of(problem, local, shared, options.chunk, least))
         if options.prior == "auto" and options.scattering != "unknown":
             said = all_messages(problem, local, shared, options.chunk)
             smooth = best_smoothness(said, chosen.mask)

@@ -75,9 +75,9 @@ def global_parameters(separation: Separation, stack: PhotometricStack | None) ->
     sd = {name: math.sqrt(max(0.0, float(values[i, i]))) for i, name in enumerate(order)}
     n_s = float(separation.n_s)
     sds = {**sd, "n_s": n_s * sd["log_n_s"]} if "log_n_s" in sd else sd
-    sds |= {
-        f"a_{k + 1}": abs(float(separation.a[k])) * sd[f"log_a_{k + 1}"] for k in range(3) if f"log_a_{k + 1}" in sd
-    }
+    for k, name in enumerate(("log_a_1", "log_a_2", "log_a_3")):
+        if name in sd:
+            sds[f"a_{k + 1}"] = abs(float(separation.a[k])) * sd[name]
     found = [
         (f"a_{k + 1}", float(separation.a[k]), f"offset of the lobe under basis light {separation.basis[k]}")
         for k in range(3)

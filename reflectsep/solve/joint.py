@@ -59,7 +59,7 @@ class JointSolution:
     history: tuple[float, ...]
 
 
-def solve_joint(
+def solve_joint(  # noqa: PLR0913  (a problem, where it starts, and when it ends)
     problem: JointProblem,
     local: Float[Tensor, "P blocks"],
     shared: Float[Tensor, "G"],
@@ -78,10 +78,10 @@ def solve_joint(
     if len(problem) == 0:
         raise ValueError("a joint solve of no blocks")
 
-    def settled(at: Tensor, start: Tensor, shared: Tensor, limit: Termination) -> Solution:
-        return solve_in_chunks(len(problem), chunk, shared, limit, lambda cut: (problem.take(cut), at[:, cut]))
+    def settled(at: Tensor, shared: Tensor) -> Solution:
+        return solve_in_chunks(len(problem), chunk, shared, inner, lambda cut: (problem.take(cut), at[:, cut]))
 
-    now = settled(local, local, shared, inner)
+    now = settled(local, shared)
     damping, status = 1e-3, Status.EXHAUSTED
     history: list[float] = []
     index = free.nonzero()[:, 0]
@@ -100,7 +100,7 @@ def solve_joint(
             trial = shared.clone()
             trial[index] += step
             trial = problem.bounded(trial)
-            found = settled(now.local, now.local, trial, inner)
+            found = settled(now.local, trial)
             if total(found, trial) < before:
                 moved = found, trial
                 break
