@@ -428,7 +428,7 @@ class PixelProblem:
             axis[column] = 1.0
             with forward_ad.dual_level():
                 found = forward_ad.unpack_dual(self.residuals(local, forward_ad.make_dual(shared, axis)))
-                J[:, column] = found.tangent
+                J[:, column] = 0.0 if found.tangent is None else found.tangent
         return J
 
     def shared_rows(self, shared: Float[Tensor, "G"]) -> Float[Tensor, "rows"]:
