@@ -142,6 +142,9 @@ class FitSettings:
         at_least=0.0,
         at_most=1.0,
     )
+    materials: int | None = setting(
+        None, "materials of different gloss; null: as many as the pictures want", at_least=1, at_most=4
+    )
     refine_n_d: bool = setting(False, "fit n_d too")
     alpha_sd: float = setting(
         0.0,

@@ -289,6 +289,8 @@ class Learnt:
     covariance: tuple[tuple[float, ...], ...]
     noise: float
     """Standard deviation of one residual, in the capture's units."""
+    kinds: int = 1
+    """Materials."""
     smooth: tuple[float, float] | None = None
     """Width in pixels of the neighbourhood that has a say in a pixel's lobe, and the spread of lobes about it."""
 
@@ -308,6 +310,10 @@ class Fit:
     """Share of Schlick's Fresnel term that the body obeys; 0: none, the paper's formula."""
     ggx: bool
     """Whether the lobe is that of GGX microfacets; else the paper's power."""
+    materials: Float[Tensor, "K 2"]
+    """Of every material: C_1 over that of the first, and n_s; a and n_s are those of the first."""
+    material: Int[Tensor, "height width"]
+    """Which material a pixel is of, from 0."""
     global_names: tuple[str, ...]
     """Order of `covariance`: the globals that were free."""
     covariance: Float[Tensor, "globals globals"]

@@ -198,13 +198,15 @@ def _handed(folder: Path, document: Mapping[str, Any], use: Literal["held", "sta
         order=order,
         covariance=tuple(numbers(row) for row in covariance["values"]),
         noise=positive(known["noise"]),
+        kinds=int(known["kinds"]),
         smooth=None if known["smooth"] is None else (positive(known["smooth"][0]), positive(known["smooth"][1])),
     )
     basis = [str(name) for name in document["basis"]]
     names = (*basis, *(str(name) for name in document["lights"] if name not in basis))
-    wide = 8 + 3 * (len(names) - 3)
-    if len(learnt.shared) not in (8, wide):
-        raise ValueError(f"{len(learnt.shared)} globals; 8 or {wide} were expected")
+    own = 8 + 2 * (learnt.kinds - 1)
+    wide = own + 3 * (len(names) - 3)
+    if len(learnt.shared) not in (own, wide):
+        raise ValueError(f"{len(learnt.shared)} globals; {own} or {wide} were expected")
     if any(len(row) != len(order) for row in (learnt.covariance, *learnt.covariance)):
         raise ValueError(f"a covariance that is not {len(order)} x {len(order)}")
     alpha = matrix(known["alpha"], len(names))

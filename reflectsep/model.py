@@ -48,9 +48,9 @@ TINY = 1e-12
 class Globals:
     """Parameters that all pixels share."""
 
-    a: Float[Tensor, "3"]
-    """C_1 L_k . V of the basis lights; negative for a forward lobe."""
-    n_s: Float[Tensor, ""]
+    a: Float[Tensor, "3 *pixels"]
+    """C_1 L_k . V of the basis lights, negative for a forward lobe; of each pixel where there are several materials."""
+    n_s: Float[Tensor, "*pixels"]
     n_d: Float[Tensor, ""] | float
     """A plain number where it is not fitted."""
     f: Float[Tensor, ""]
@@ -158,7 +158,8 @@ def lobe_by_exponent(u: Tensor, size: Tensor, n_s: Tensor, ggx: bool) -> Tensor:
 def lobe_vector(d: Roots, s: Roots, B: Float[Tensor, "*pixels"], shared: Globals) -> Float[Tensor, "3 *pixels"]:
     """A + B m, with m the mean of d + (1 - f) s over the channels (Eq. 18)."""
     m = (d + (1.0 - shared.f) * s).mean(1)
-    return shared.a.view(3, *[1] * B.ndim) + B * m
+    a = shared.a if shared.a.ndim > 1 else shared.a.view(3, *[1] * B.ndim)
+    return a + B * m
 
 
 def lobe_of(

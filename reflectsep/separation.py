@@ -34,7 +34,7 @@ from reflectsep.room import cuts, empty, room_beside, stacked
 
 COMPONENTS = ("specular", "local_diffuse", "scattering", "diffuse", "highlight_free")
 LAYERS = (*(f"{name}.exr" for name in COMPONENTS), "residual.exr", "parameters.exr")
-MAPS = (*COMPONENTS, "mask", "flags", "d", "s", "B", "d_sd", "s_sd", "B_sd", "residual")
+MAPS = (*COMPONENTS, "mask", "flags", "material", "d", "s", "B", "d_sd", "s_sd", "B_sd", "residual")
 PIXELS_AT_ONCE = 1 << 18
 """Of which components are made."""
 PEAK_FACTOR = 2.0
@@ -63,6 +63,10 @@ class Separation:
     fresnel: Float[Tensor, ""]
     ggx: bool
     """Whether the lobe is that of GGX microfacets; else the paper's power."""
+    materials: Float[Tensor, "K 2"]
+    """Of every material: C_1 over that of the first, and n_s; a and n_s are those of the first."""
+    material: Int[Tensor, "height width"]
+    """Which material a pixel is of, from 0."""
     d: Float[Tensor, "3 channels height width"]
     s: Float[Tensor, "3 channels height width"]
     B: Float[Tensor, "height width"]
@@ -77,9 +81,9 @@ class Separation:
     highlight_free: Float[Tensor, "3 channels height width"]
     """Picture minus specular: keeps what the model does not explain; the whole diffuse where the picture is clipped."""
     residual: Float[Tensor, "lights channels height width"]
-    ceiling: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(math.inf))
-    """Largest |w| of a lobe when relighting: that of a highlight `PEAK_FACTOR` times as high as those of most pixels.
-    Where no picture saw the highlight, nothing else bounds it."""
+    ceilings: Float[Tensor, "K"] = field(default_factory=lambda: torch.tensor([math.inf]))
+    """Of every material, the largest |w| of a lobe when relighting: of a highlight `PEAK_FACTOR` times as high as those
+    of most pixels. Where no picture saw the highlight, nothing else bounds it."""
     document: Mapping[str, Any]
     """What `separation.json` says beside the globals: settings, versions, timings, statistics."""
 
@@ -99,9 +103,13 @@ class Separation:
     def globals(self) -> Globals:
         """The shared parameters as the model takes them."""
         n_d = 1.0 if float(self.n_d) == 1.0 else self.n_d
+        a, n_s = self.a, self.n_s
+        if len(self.materials) > 1:
+            scale, exponents = self.materials.T
+            a, n_s = a[:, None, None] * scale[self.material.long()], exponents[self.material.long()]
         return Globals(
-            a=self.a,
-            n_s=self.n_s,
+            a=a,
+            n_s=n_s,
             n_d=n_d,
             f=self.f,
             softness=self.softness,
@@ -109,6 +117,11 @@ class Separation:
             ggx=self.ggx,
             M=self.M,
         )
+
+    @property
+    def ceiling(self) -> Tensor:
+        """Largest |w| of a lobe when relighting; of every pixel where there are several materials."""
+        return self.ceilings[0] if len(self.ceilings) == 1 else self.ceilings[self.material.long()]
 
     @property
     def M(self) -> Float[Tensor, "3 3"]:  # noqa: N802  (the symbol of `reflectsep.model`)
@@ -188,6 +201,7 @@ class Separation:
             planes |= picture_channels(tuple(f"{stem}{k}{tail}" for k in ranks), stack, channels)
         planes["B"], planes["B_sd"] = self.B.numpy(), self.B_sd.numpy()
         planes["flags"] = self.flags.numpy().astype(np.uint32)
+        planes["material"] = self.material.numpy().astype(np.uint32)
         planes["mask"] = self.mask.numpy().astype(np.uint32)
         return planes
 
@@ -200,7 +214,8 @@ class Separation:
                 lights[name]["vector"] = vectors[i].tolist()
         shared = {name: getattr(self, name).tolist() for name in ("a", "n_s", "n_d", "f", "softness", "fresnel")}
         shared["lobe"] = "ggx" if self.ggx else "power"
-        shared |= {"ceiling": self.ceiling.tolist()} if bool(self.ceiling.isfinite()) else {}
+        shared["materials"] = self.materials.tolist()
+        shared |= {"ceilings": self.ceilings.tolist()} if bool(self.ceilings.isfinite().all()) else {}
         return {
             **self.document,
             "basis": list(self.basis),
@@ -246,6 +261,8 @@ def separate(
         softness=fit.softness,
         fresnel=fit.fresnel,
         ggx=fit.ggx,
+        materials=fit.materials,
+        material=fit.material,
         d=fit.d,
         s=fit.s[:3],
         B=fit.B,
@@ -267,20 +284,25 @@ def separate(
             return separation.s[:, :, rows]
         return scattering.root[:3, :, rows].float() / intensity_root
 
-    return with_components(replace(separation, ceiling=lobe_ceiling(separation)), stack, measured)
+    return with_components(replace(separation, ceilings=lobe_ceilings(separation)), stack, measured)
 
 
-def lobe_ceiling(separation: Separation) -> Float[Tensor, ""]:
-    """`Separation.ceiling`: from the 99 % quantile of |w|, so that a few wrong pixels do not set it."""
-    sizes = []
+def lobe_ceilings(separation: Separation) -> Float[Tensor, "K"]:
+    """`Separation.ceilings`: from the 99 % quantile of |w|, so that a few wrong pixels do not set it."""
+    sizes, kinds = [], []
+    step = max(1, separation.mask.numel() >> 20)
     for rows in bands(separation.mask):
         part = separation.rows(rows)
-        sizes.append(length(part.M, part.lobe_vector)[part.mask][:: max(1, separation.mask.numel() >> 20)])
-    found = torch.cat(sizes)
-    if len(found) == 0:
-        return separation.a.new_tensor(math.inf)
-    high = found.kthvalue(max(1, int(0.99 * len(found)))).values
-    return PEAK_FACTOR ** (1.0 / separation.n_s) * high
+        sizes.append(length(part.M, part.lobe_vector)[part.mask][::step])
+        kinds.append(part.material[part.mask][::step])
+    size, kind = torch.cat(sizes), torch.cat(kinds)
+    result = torch.full((len(separation.materials),), math.inf)
+    for k, n_s in enumerate(separation.materials[:, 1]):
+        found = size[kind == k]
+        if len(found):
+            high = found.kthvalue(max(1, int(0.99 * len(found)))).values
+            result[k] = PEAK_FACTOR ** (1.0 / n_s) * high
+    return result
 
 
 def bands(mask: Bool[Tensor, "height width"]) -> Iterator[slice]:
@@ -319,7 +341,10 @@ def _components(separation: Separation, stack: PhotometricStack, measured: Tenso
 def extensions(separation: Separation | Fit) -> str:
     """What a result has beyond the paper's formula, in a sentence; empty where it has nothing."""
     f, e, k = float(separation.f), float(separation.softness), float(separation.fresnel)
-    parts = [f"GGX lobe of roughness {1.0 / math.sqrt(1.0 + float(separation.n_s)):.2f}"] if separation.ggx else []
+    rough = ", ".join(f"{1.0 / math.sqrt(1.0 + n_s):.2f}" for n_s in separation.materials[:, 1].tolist())
+    count = len(separation.materials)
+    kinds = f"{count} materials, " if count > 1 else ""
+    parts = [f"{kinds}GGX lobe of roughness {rough}"] if separation.ggx else []
     parts += [f"the lobe turns with d + {1 - f:.2f} s"] if f < 1 else []
     parts += [f"shadow edges soft by {e:.2f} of the cosine"] if e > 0.02 else []
     parts += [f"{100 * k:.0f} % of Fresnel's losses in the body"] if k > 0 else []
@@ -362,6 +387,7 @@ def from_layers(folder: Path, document: Mapping[str, Any]) -> Separation:
     maps |= {name: torch.from_numpy(parameters[name].astype(np.float32)) for name in ("B", "B_sd")}
     maps["mask"] = torch.from_numpy(parameters["mask"].astype(np.int64)) > 0
     maps["flags"] = torch.from_numpy(parameters["flags"].astype(np.int32))
+    maps["material"] = torch.from_numpy(parameters["material"].astype(np.int32))
     del parameters
     maps |= {name: stack(layers[f"{name}.exr"](), basis) for name in COMPONENTS}
     maps["residual"] = stack(layers["residual.exr"](), names)

@@ -37,7 +37,7 @@ LEAST_SHARE = 0.02
 LEAST_OVERLAP_PX = 8
 """Windows of neighbours and filled holes reach about as far."""
 LEAST_SAY = 1e-6
-GLOBALS = ("a", "n_s", "n_d", "f", "softness", "fresnel")
+GLOBALS = ("a", "n_s", "n_d", "f", "softness", "fresnel", "materials")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,8 +178,8 @@ def join(names: Sequence[str], parts: Sequence[Separation], size: tuple[int, int
         maps["mask"][place] |= part.mask
         outside[place] = torch.where(part.mask, outside[place], part.flags)
     maps["flags"] = chosen([part.flags for part in parts], regions, share, outside)
-    ceiling = torch.stack([part.ceiling for part in parts]).amax()
-    joined = replace(parts[0], **maps, ceiling=ceiling)
+    ceilings = torch.stack([part.ceilings for part in parts]).nan_to_num(posinf=0.0).amax(0)
+    joined = replace(parts[0], **maps, ceilings=torch.where(ceilings > 0, ceilings, torch.inf))
     return replace(joined, document=_document(joined, parts, regions, tiling))
 
 

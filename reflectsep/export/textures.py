@@ -60,13 +60,15 @@ def textures_of(separation: Separation, *, white: float) -> Textures:
     normal = torch.where(mask, normal, torch.tensor([0.0, 0.0, 1.0], dtype=normal.dtype)[:, None, None])
     n_d = float(separation.n_d)
     albedo = positive_power((g * normal[:, None]).sum(0), n_d) * intensity / white
-    h = length(separation.M.double(), separation.lobe_vector.double()).clamp(max=float(separation.ceiling))
-    n_s = float(separation.n_s)
+    h = length(separation.M.double(), separation.lobe_vector.double()).minimum(separation.ceiling.double())
+    kinds = torch.bincount(separation.material[mask].long(), minlength=len(separation.materials))
+    # One roughness for the whole: that of the largest material.
+    n_s = float(separation.materials[kinds.argmax(), 1])
     whole = separation.diffuse.double().mean(0)
     share = separation.scattering.double().mean(0) / whole.clamp_min(1e-12)
     return Textures(
         base_colour=albedo * mask,
-        specular=(lobe(h, h, separation.n_s.double(), separation.ggx) * intensity / white * mask)[None],
+        specular=(lobe(h, h, separation.globals.n_s.double(), separation.ggx) * intensity / white * mask)[None],
         normal=normal,
         scattering_colour=torch.where(mask & (whole > 1e-6 * white), share, 0.0).clamp(0.0, 1.0),
         alpha=1.0 / math.sqrt(1.0 + n_s) if separation.ggx else math.sqrt(2.0 / (4.0 * n_s + 2.0)),

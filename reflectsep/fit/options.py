@@ -22,6 +22,8 @@ class FitOptions:
     """Fixed exponent of the lobe; None: fitted."""
     f: float | None = None
     """Fixed share of the scattered light that has forgotten the normal (1 in the paper); None: fitted."""
+    materials: int | None = None
+    """Number of materials, each with a height and an exponent of its own; None: as many as the pictures want."""
     refine_n_d: bool = False
     """Fit n_d too, from where the sweeps put it."""
     alpha_sd: float = 0.0

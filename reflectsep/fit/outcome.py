@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -10,10 +12,13 @@ from reflectsep.data import Fit, Learnt, PhotometricStack, Scattering
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     ALPHA,
-    LOG_N_S,
+    LEAST_N_S,
+    MOST_N_S,
     SHARED_NAMES,
     PixelProblem,
+    deltas,
     globals_of,
+    materials_of,
     refined,
 )
 from reflectsep.fit.state import State
@@ -44,8 +49,10 @@ def describe(
     problem, shared = state.problem, state.shared
     assert state.cost is not None
     assert state.status is not None
-    g = globals_of(shared, problem.obs)
-    names = names_of(stack, shared)
+    kinds = problem.obs.kinds
+    g = globals_of(shared, replace(problem.obs, material=None))
+    scale, exponents = materials_of(shared, kinds)
+    names = names_of(stack, shared, kinds)
     if options.held is None:
         covariance = shared_covariance(state, options.chunk)
         order = tuple(name for name, free in zip(names, state.free.tolist(), strict=True) if free)
@@ -64,6 +71,8 @@ def describe(
         softness=g.softness.abs().float(),
         fresnel=g.fresnel.float(),
         ggx=g.ggx,
+        materials=torch.stack([scale.exp(), exponents.exp()], 1).float(),
+        material=material_map(state),
         global_names=order,
         covariance=told,
         intensity=strength.float(),
@@ -79,6 +88,7 @@ def describe(
             order=order,
             covariance=tuple(tuple(row) for row in told.tolist()),
             noise=problem.sigma,
+            kinds=kinds,
             smooth=None if state.smooth is None else (state.smooth.width_px, state.smooth.spread),
         ),
         warnings=warnings(state, options, pictures),
@@ -174,23 +184,34 @@ def carried_covariance(held: Learnt, names: tuple[str, ...], like: Tensor) -> Fl
     return covariance
 
 
-def names_of(stack: PhotometricStack, shared: Float[Tensor, "G"]) -> tuple[str, ...]:
+def material_map(state: State) -> Int[Tensor, "height width"]:
+    """Material of every pixel; 0 outside the mask."""
+    picture = torch.zeros(state.mask.shape, dtype=torch.int32)
+    if state.problem.obs.material is not None:
+        picture[state.mask] = state.problem.obs.material.to(torch.int32)
+    return picture
+
+
+def names_of(stack: PhotometricStack, shared: Float[Tensor, "G"], kinds: int) -> tuple[str, ...]:
     """Names of the globals; a refined alpha is named after its light and its basis light."""
     others = [f"alpha_{name}_{basis}" for name in stack.names[3:] for basis in stack.names[:3]]
-    return (*SHARED_NAMES, *others) if len(shared) > ALPHA else SHARED_NAMES
+    more = [f"{what}_{kind}" for kind in range(2, kinds + 1) for what in ("log_C_1", "log_n_s")]
+    refined_too = len(shared) > ALPHA + len(more)
+    return (*SHARED_NAMES, *(others if refined_too else []), *more)
 
 
 def refined_alpha(
     state: State, intensity: Float[Tensor, "lights"], covariance: Float[Tensor, "G G"]
 ) -> tuple[Float[Tensor, "lights 3"] | None, Float[Tensor, "lights 3"] | None, Float[Tensor, "lights"]]:
     """Alphas in the capture's units and their standard deviation, None where they were held; and all intensities."""
-    if len(state.shared) == ALPHA:
+    if len(deltas(state.shared, state.problem.obs)) == 0:
         return None, None, intensity
     light = refined(state.problem.obs.take(slice(0, 1)), state.shared)
     strength = intensity * light.intensity
     alpha = light.obs.alpha * strength[:, None] / intensity[:3]
     sd = torch.zeros_like(alpha)
-    sd[3:] = covariance.diagonal()[ALPHA:].clamp_min(0.0).sqrt().view(-1, 3)
+    count = len(deltas(state.shared, state.problem.obs))
+    sd[3:] = covariance.diagonal()[ALPHA : ALPHA + count].clamp_min(0.0).sqrt().view(-1, 3)
     return alpha.float(), (sd * intensity[:, None] / intensity[:3]).float(), strength
 
 
@@ -202,7 +223,7 @@ def shared_covariance(state: State, chunk: int) -> Float[Tensor, "G G"]:
         return covariance
     sampled = state.sampled
     every = torch.arange(len(sampled.problem))
-    S, _ = reduced(sampled.problem, sampled.local, state.shared, chunk, every)
+    S, _, _ = reduced(sampled.problem, sampled.local, state.shared, chunk, every)
     covariance[index[:, None], index] = torch.linalg.pinv(S[index][:, index], hermitian=True)
     return covariance
 
@@ -240,9 +261,9 @@ def warnings(state: State, options: FitOptions, pictures: Pictures) -> tuple[str
             f"only {seen} pixels show the highlight in two or more pictures: n_s, a and B rest on what is expected of "
             "a highlight; the specular component is not to be trusted"
         )
-    n_s = float(state.shared[LOG_N_S].exp())
-    if bool(state.free[LOG_N_S]) and not 0.5 < n_s < 3000:
-        said.append(f"n_s ended at {n_s:.3g}: the pictures show no lobe that all pixels share")
+    for n_s in materials_of(state.shared, state.problem.obs.kinds)[1].exp().tolist():
+        if bool(state.free.any()) and not LEAST_N_S * 1.01 < n_s < MOST_N_S / 1.01:
+            said.append(f"n_s ended at {n_s:.3g}: the pictures show no lobe that all pixels share")
     if state.joint is not None and state.joint.status == Status.FAILED:
         said.append("the joint fit found no globals that lower the cost")
     if not state.problem.obs.lights_known:

@@ -1,7 +1,8 @@
 """Eqs. 20 to 22 as a least-squares problem of blocks: one block a pixel, pixels last in memory.
 
     local   l = (d_11, d_12, .., d_1C, d_21, .., d_3C; log B)         basis light by basis light; 3 C + 1 numbers
-    shared  g = (log -a_1, log -a_2, log -a_3, log n_s, f, softness, fresnel, log n_d [; delta_41, delta_42, ..])
+    shared  g = (log -a_1, log -a_2, log -a_3, log n_s, f, softness, fresnel, log n_d [; delta_41, delta_42, ..]
+                 [; log C_1 of material 2 over that of the first, its log n_s; of material 3 ..])
 
 Residuals of a pixel are (model - picture) / sigma for every light and channel, clipped values counting only where the
 model is darker, large ones by Huber's loss; and two rows of what is expected of a pixel before its pictures are seen:
@@ -27,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -53,6 +54,10 @@ COMMON_SD = 0.01
 """Relative standard deviation of a_k / (L_k . V) among the basis lights: Eq. 7 makes them one number, C_1."""
 LOG_N_S_CENTRE, LOG_N_S_SD = math.log(20.0), 1.5
 """What is expected of n_s before any picture is seen: it decides only where no picture does."""
+LEAST_N_S, MOST_N_S = 1.0, 5000.0
+"""A lobe of GGX roughness 0.7 is the roughest that is told from a body, one of 0.014 is a mirror."""
+LEAST_N_S_OTHER = 2.5
+"""The same of a further material, roughness 0.53: a rougher one would take up what is wrong with the body's shading."""
 SOFTNESS_SD = 0.5
 FRESNEL_SD = 0.5
 
@@ -84,6 +89,10 @@ class Observations:
     """Of every light: its s was measured, not mixed; empty: only those of the basis."""
     share: Float[Tensor, "lights 1 1"]
     """sqrt(lambda_j) of Eq. 22."""
+    kinds: int = 1
+    """Materials, each with a height and an exponent of its own."""
+    material: Int[Tensor, "pixels"] | None = None
+    """Which of them a pixel is of; None where there is one."""
 
     def __len__(self) -> int:
         """Number of pixels."""
@@ -102,6 +111,7 @@ class Observations:
             images=self.images[..., index].to(kind),
             s=self.s[..., index].to(kind),
             clipped=self.clipped[..., index],
+            material=None if self.material is None else self.material[index],
         )
 
 
@@ -140,9 +150,13 @@ def upper_times(R: Float[Tensor, "6 *rest"], v: Float[Tensor, "3 *rest"]) -> Flo
 
 def globals_of(shared: Float[Tensor, "G"], obs: Observations) -> Globals:
     """The shared unknowns by name."""
+    a, n_s = -shared[:3].exp(), shared[LOG_N_S].exp()
+    if obs.material is not None:
+        scale, exponent = materials_of(shared, obs.kinds)
+        a, n_s = a[:, None] * scale.exp()[obs.material], exponent.exp()[obs.material]
     return Globals(
-        a=-shared[:3].exp(),
-        n_s=shared[LOG_N_S].exp(),
+        a=a,
+        n_s=n_s,
         n_d=shared[LOG_N_D].exp() if obs.fixed_n_d is None else obs.fixed_n_d,
         f=shared[F],
         softness=shared[SOFTNESS],
@@ -152,9 +166,22 @@ def globals_of(shared: Float[Tensor, "G"], obs: Observations) -> Globals:
     )
 
 
+def materials_of(shared: Float[Tensor, "G"], kinds: int) -> tuple[Float[Tensor, "K"], Float[Tensor, "K"]]:
+    """Log of every material's C_1 over that of the first, and log of its n_s."""
+    others = shared[len(shared) - 2 * (kinds - 1) :].view(-1, 2)
+    return (torch.cat([torch.zeros_like(shared[:1]), others[:, 0]]), torch.cat([shared[LOG_N_S, None], others[:, 1]]))
+
+
+def deltas(shared: Float[Tensor, "G"], obs: Observations) -> Float[Tensor, "others*3"]:
+    """What is added to the stated alphas; empty where they are held."""
+    return shared[ALPHA : len(shared) - 2 * (obs.kinds - 1)]
+
+
 def log_size(shared: Float[Tensor, "G"], obs: Observations) -> Tensor:
-    """Log of -C_1 = |w| in the mirror direction: a_k / (L_k . V) of the basis lights, averaged."""
+    """Log of -C_1 = |w| in the mirror direction: a_k / (L_k . V) of the basis lights, averaged; of every pixel."""
     size = (shared[:3] - obs.cosine.log()).mean()
+    if obs.material is not None:
+        size = size + materials_of(shared, obs.kinds)[0][obs.material]
     return size if obs.lights_known else size + math.log(3.0) / 2.0  # |a| itself, M being the identity
 
 
@@ -172,9 +199,10 @@ def refined(obs: Observations, shared: Float[Tensor, "G"]) -> Refined:
     The length of the mixed vector is the light's intensity, which scales the picture and stays out of the powers. The
     basis lights' own rows stay the identity: they set the scale of d and s.
     """
-    if len(shared) == ALPHA:
+    added = deltas(shared, obs)
+    if len(added) == 0:
         return Refined(obs, torch.ones_like(obs.alpha[:, 0]))
-    beta = torch.cat([obs.alpha[:3], obs.alpha[3:] + shared[ALPHA:].view(-1, 3)])
+    beta = torch.cat([obs.alpha[:3], obs.alpha[3:] + added.view(-1, 3)])
     t = torch.ones_like(beta[:, 0])
     if obs.lights_known:
         t = torch.cat([t[:3], (beta[3:] @ torch.linalg.inv(obs.M)).norm(dim=-1)])
@@ -237,7 +265,7 @@ class PixelProblem:
         rows = [(misfit * self.weight).flatten(0, 1)]
         z = B * (d + (1.0 - g.f) * obs.s[:3]).mean(1)
         if math.isfinite(self.height_spread):
-            size = length(g.M, g.a[:, None] + z)
+            size = length(g.M, g.a.view(3, -1) + z)
             rows.append((g.n_s * (size.log() - log_size(shared, obs)) / self.height_spread)[None])
         if self.neighbours is not None:
             rows.append(self.neighbours.rows(z / (2.0 * log_size(shared, obs).exp())))
@@ -278,7 +306,7 @@ class PixelProblem:
         radial = mixed(g.M.mT, Mb) / q
         m = (d + (1.0 - g.f) * s).mean(1)
         z = B * m
-        v = g.a[:, None] + z
+        v = g.a.view(3, -1) + z
         Mv = mixed(g.M, v)
         size = (Mv.square().sum(0) + 1e-12).sqrt()
         u = mixed(obs.alpha, v)
@@ -417,13 +445,21 @@ class PixelProblem:
             J[count, LOG_N_S] = at.rows[count]
         value = lobe_by_exponent(at.u, at.size, g.n_s, g.ggx)
         J[:count, LOG_N_S] = (g.n_s * value[:, None] * at.scale).flatten(0, 1)
+        for kind in range(1, self.obs.kinds):
+            # Another material's own height and exponent: what those of all would do, at its pixels alone.
+            here = (self.obs.material == kind).to(J.dtype)
+            first = len(shared) - 2 * (self.obs.kinds - kind)
+            J[:, first] = J[:, :3].sum(1) * here
+            J[:, first + 1] = J[:, LOG_N_S] * here
+        if self.obs.material is not None:
+            J[:, LOG_N_S] *= (self.obs.material == 0).to(J.dtype)
         by_softness, by_fresnel = transmitted_by_globals(at.c, g.softness, g.fresnel)
         for column, slope in ((SOFTNESS, by_softness), (FRESNEL, by_fresnel)):
             J[:count, column] = (at.q * slope * at.chain * at.scale).flatten(0, 1)
         if self.obs.fixed_n_d is None:
             body = at.body
             J[:count, LOG_N_D] = (body * body.clamp_min(1e-30).log() * at.scale).flatten(0, 1)
-        for column in range(ALPHA, len(shared)):
+        for column in range(ALPHA, ALPHA + len(deltas(shared, self.obs))):
             axis = torch.zeros_like(shared)
             axis[column] = 1.0
             with forward_ad.dual_level():
@@ -438,18 +474,20 @@ class PixelProblem:
         rows.append(((shared[LOG_N_D] - math.log(self.obs.n_d)) / self.obs.n_d_sd)[None])
         if self.priors:
             expected = (
-                (shared[LOG_N_S] - LOG_N_S_CENTRE) / LOG_N_S_SD,
                 shared[SOFTNESS] / SOFTNESS_SD,
                 (shared[FRESNEL] - 0.5) / FRESNEL_SD,
             )
-            rows.append(torch.stack(expected))
-        return torch.cat([*rows, shared[ALPHA:] / self.alpha_sd])
+            exponents = materials_of(shared, self.obs.kinds)[1]
+            rows += [torch.stack(expected), (exponents - LOG_N_S_CENTRE) / LOG_N_S_SD]
+        return torch.cat([*rows, deltas(shared, self.obs) / self.alpha_sd])
 
     def bounded(self, shared: Float[Tensor, "G"]) -> Float[Tensor, "G"]:
-        """F and fresnel are shares; an exponent below 0.3 or above 5000 is no lobe."""
+        """F and fresnel are shares; exponents have their bounds."""
         result = shared.clone()
         result[[F, FRESNEL]] = result[[F, FRESNEL]].clamp(0.0, 1.0)
-        result[LOG_N_S] = result[LOG_N_S].clamp(math.log(0.3), math.log(5000.0))
+        result[LOG_N_S] = result[LOG_N_S].clamp(math.log(LEAST_N_S), math.log(MOST_N_S))
+        others = list(range(len(shared) - 2 * (self.obs.kinds - 1) + 1, len(shared), 2))
+        result[others] = result[others].clamp(math.log(LEAST_N_S_OTHER), math.log(MOST_N_S))
         return result
 
 

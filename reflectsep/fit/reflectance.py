@@ -17,6 +17,7 @@ from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.errors import FitError
 from reflectsep.fit.autograd import UnknownScattering
 from reflectsep.fit.body import robust_body
+from reflectsep.fit.materials import MOST, Materials, assigned, split
 from reflectsep.fit.neighbours import Messages, Smoothness, best_smoothness, messages, neighbours
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.outcome import describe
@@ -29,12 +30,13 @@ from reflectsep.fit.problem import (
     F,
     Observations,
     PixelProblem,
+    globals_of,
     log_size,
 )
 from reflectsep.fit.sample import SAMPLE, sample
 from reflectsep.fit.state import Sampled, State
 from reflectsep.flags import Flag
-from reflectsep.model import mixed
+from reflectsep.model import lobe_of, mixed
 from reflectsep.progress import Progress, silent
 from reflectsep.room import empty
 from reflectsep.solve.joint import JointSolution, solve_joint
@@ -62,6 +64,10 @@ TRIM_TELLING, TRIM = 0.8, 0.95
 """Share of the pixels that has a say in the globals: those that the model explains best."""
 ROUNDS = 4
 """Times that neighbours and noise are learnt, and the globals with them."""
+FURTHER_ROUNDS = 2
+"""The same after another material was found."""
+JOINT = Termination(tolerance=1e-6, max_iterations=6)
+"""Of the globals, and of the pixels that follow them."""
 SWEEPS = 2
 """Times that every pixel hears of its neighbours."""
 
@@ -181,6 +187,7 @@ def prepare(obs: Observations, mask: Bool[Tensor, "height width"], options: FitO
     held = options.held
     if held is not None:
         others = len(held.shared) - ALPHA
+        obs = replace(obs, kinds=held.kinds)
     shared = obs.alpha.new_zeros(ALPHA + others)
     fitted = options.shading == "fitted"
     swept = bool(obs.swept) and options.scattering == "measured"
@@ -240,6 +247,36 @@ def start_of(problem: PixelProblem, shared: Tensor) -> Float[Tensor, "P pixels"]
     return first_locals(problem, shared, robust_body(obs.images, problem.sigma, obs.alpha, obs.n_d))
 
 
+def offered(
+    problem: PixelProblem, found: Solution, shared: Float[Tensor, "G"], end: Termination, chunk: int
+) -> Solution:
+    """Every pixel once more, from the lobe that its neighbours have; it keeps the cheaper solution.
+
+    What that lobe leaves of the pictures is the body.
+    """
+    if problem.neighbours is None:
+        return found
+
+    def start(cut: slice) -> tuple[PixelProblem, Tensor]:
+        part = problem.take(cut)
+        obs, g = part.obs, globals_of(shared, part.obs)
+        assert part.neighbours is not None
+        z = 2.0 * log_size(shared, obs).exp() * part.neighbours.vector
+        shine = lobe_of(g.a.view(3, -1) + z, g, obs.alpha)
+        body = robust_body(obs.images - shine[:, None], part.sigma, obs.alpha, obs.n_d)
+        m = (body - shared[F] * obs.s[:3]).mean(1)
+        B = (z * m).sum(0) / m.square().sum(0).clamp_min(1e-12)
+        return part, part.packed(body - obs.s[:3], B.clamp(1e-2, 1e3).log())
+
+    other = solve_in_chunks(len(problem), chunk, shared, end, start)
+    better = other.cost < found.cost
+    return Solution(
+        torch.where(better, other.local, found.local),
+        torch.where(better, other.cost, found.cost),
+        torch.where(better, other.status, found.status),
+    )
+
+
 def telling(problem: PixelProblem, chunk: int) -> Tensor:
     """Pixels whose pictures stand highest above their diffuse part: every second of the first 2 `TELLING`.
 
@@ -263,30 +300,48 @@ def fit_globals(state: State, options: FitOptions, progress: Progress) -> State:
     chosen = sample(state.mask, SAMPLE)
     every = state.problem.take(chosen.index)
     state = replace(state, shared=start_globals(every, state, options, progress))
-    end = Termination(tolerance=options.tolerance, max_iterations=6)
-    inner = Termination(tolerance=options.tolerance, max_iterations=6)
+    shared, free = state.shared, state.free
     whole = Termination(tolerance=options.tolerance, max_iterations=options.max_iterations)
-    problem, shared = every, state.shared
-    local = solved(problem, start_of(problem, shared), shared, whole, options).local
-    joint: JointSolution | None = None
+
+    def settle(problem: PixelProblem, local: Tensor, shared: Tensor) -> Solution:
+        return solved(problem, local, shared, whole, options)
+
+    def joint(problem: PixelProblem, local: Tensor, shared: Tensor, free: Tensor) -> JointSolution:
+        return solve_joint(problem, local, shared, free, end=JOINT, inner=JOINT, chunk=options.chunk, trim=TRIM)
+
+    last: JointSolution | None = None
     smooth: Smoothness | None = None
-    for i in range(ROUNDS):
-        progress("globals", len(START_N_S) + i, len(START_N_S) + ROUNDS)
-        least = LEAST_NOISE * state.peak
-        problem = replace(problem, sigma=noise_of(problem, local, shared, options.chunk, least))
-        if options.prior == "auto" and options.scattering != "unknown":
-            said = all_messages(problem, local, shared, options.chunk)
-            smooth = best_smoothness(said, chosen.mask)
-            problem = replace(problem, neighbours=neighbours(said, chosen.mask, smooth))
-        if options.method != "joint":
-            local = solved(problem, local, shared, whole, options).local
-            continue
-        joint = solve_joint(problem, local, shared, state.free, end=end, inner=inner, chunk=options.chunk, trim=TRIM)
-        local, shared = joint.local, joint.shared
-    progress("globals", 1, 1)
-    problem = replace(state.problem, sigma=problem.sigma)
+    problem = every
+    found = settle(problem, start_of(problem, shared), shared)
+    local = found.local
+    rounds = ROUNDS
+    while rounds:
+        for _ in range(rounds):
+            progress("globals", 1, 2)
+            problem = replace(problem, sigma=noise_of(problem, local, shared, options.chunk, LEAST_NOISE * state.peak))
+            if options.prior == "auto" and options.scattering != "unknown":
+                said = all_messages(problem, local, shared, options.chunk)
+                smooth = best_smoothness(said, chosen.mask)
+                problem = replace(problem, neighbours=neighbours(said, chosen.mask, smooth))
+            found = offered(problem, solved(problem, local, shared, whole, options), shared, whole, options.chunk)
+            local = found.local
+            if options.method == "joint":
+                last = joint(problem, local, shared, free)
+                local, shared = last.local, last.shared
+        rounds = 0
+        if options.method == "joint" and problem.obs.kinds < (options.materials or MOST):
+            # By the pictures alone: what the neighbours said rests on the materials as they were.
+            alone = replace(problem, neighbours=None)
+            found = settle(alone, local, shared)
+            now = Materials(problem=alone, local=found.local, cost=found.cost, shared=shared, free=free)
+            more = split(now, chosen.mask, settle, joint, sure=options.materials is not None)
+            if more is not None:
+                problem, local, shared, free = more.problem, more.local, more.shared, more.free
+                rounds = FURTHER_ROUNDS
+    progress("globals", 2, 2)
+    final = replace(state.problem, sigma=problem.sigma, obs=replace(state.problem.obs, kinds=problem.obs.kinds))
     sampled = Sampled(chosen, problem, local)
-    return replace(state, problem=problem, shared=shared, smooth=smooth, joint=joint, sampled=sampled)
+    return replace(state, problem=final, shared=shared, free=free, smooth=smooth, joint=last, sampled=sampled)
 
 
 def start_globals(problem: PixelProblem, state: State, options: FitOptions, progress: Progress) -> Float[Tensor, "G"]:
@@ -372,18 +427,27 @@ def fit_pixels(state: State, options: FitOptions, progress: Progress) -> State:
     whole = Termination(tolerance=options.tolerance, max_iterations=options.max_iterations)
     steps = 1 + (SWEEPS if state.smooth is not None else 0)
     progress("pixels", 0, steps)
-    found = solve_in_chunks(
-        len(problem),
-        options.chunk,
-        shared,
-        whole,
-        lambda cut: (part := problem.take(cut), start_of(part, shared)),
-    )
+    if state.sampled is not None and len(state.sampled.chosen.index) == len(problem):
+        problem = state.sampled.problem
+        found = solved(problem, state.sampled.local, shared, whole, options)
+        steps = min(steps, 2)
+    else:
+
+        def first(problem: PixelProblem, _: Tensor, shared: Tensor) -> Solution:
+            return solve_in_chunks(
+                len(problem),
+                options.chunk,
+                shared,
+                whole,
+                lambda cut: (part := problem.take(cut), start_of(part, shared)),
+            )
+
+        found, problem = assigned(problem, state.local, shared, state.mask, first)
     for i in range(1, steps):
         progress("pixels", i, steps)
         assert state.smooth is not None
         said = all_messages(problem, found.local, shared, options.chunk)
         problem = replace(problem, neighbours=neighbours(said, state.mask, state.smooth))
-        found = solved(problem, found.local, shared, whole, options)
+        found = offered(problem, solved(problem, found.local, shared, whole, options), shared, whole, options.chunk)
     progress("pixels", steps, steps)
     return replace(state, problem=problem, local=found.local, cost=found.cost, status=found.status)

@@ -40,7 +40,8 @@ def cost_valley(separation: Separation, stack: PhotometricStack, *, count: int =
 
     Gauss-Newton on d (3 unknowns a pixel) with a damping of its own for every pixel and place of the grid.
     """
-    shows = separation.mask & ((separation.flags & int(Flag.FAINT_LOBE)) == 0)
+    # Of one material: the first, which most of the object is of.
+    shows = separation.mask & (separation.material == 0) & ((separation.flags & int(Flag.FAINT_LOBE)) == 0)
     good = shows & ~stack.saturated.any(0).any(0) & stack.images.isfinite().all(0).all(0)
     where = torch.nonzero(good)
     if len(where) < 10:
@@ -85,7 +86,7 @@ class _Case:
     def residual(self, x: Float[Tensor, "*grid pixels unknowns"], a: Tensor, B: Tensor) -> Tensor:
         """Model minus picture; x is d, or d and B over its start `B`."""
         d, B = x[..., :3], B * x[..., 3] if x.shape[-1] == 4 else B
-        g = in_double(self.separation.globals)
+        g = in_double(replace(self.separation, materials=self.separation.materials[:1]).globals)
         first = lambda x: x.movedim(-1, 0)  # noqa: E731
         whole = first(d + self.s)
         body = diffuse(mixed(self.alpha, whole), length(g.M, whole), g)

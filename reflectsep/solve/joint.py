@@ -78,8 +78,17 @@ def solve_joint(  # noqa: PLR0913  (a problem, where it starts, and when it ends
     if len(problem) == 0:
         raise ValueError("a joint solve of no blocks")
 
-    def settled(at: Tensor, shared: Tensor) -> Solution:
-        return solve_in_chunks(len(problem), chunk, shared, inner, lambda cut: (problem.take(cut), at[:, cut]))
+    def settled(at: Tensor, shared: Tensor, other: Tensor | None = None) -> Solution:
+        def start(cut: slice) -> tuple[Problem, Tensor]:
+            part, here = problem.take(cut), at[:, cut].contiguous()
+            if other is None:
+                return part, here
+            # Where the linear model has a block, unless that is worse than where it was.
+            there = other[:, cut].contiguous()
+            better = part.normal(there, shared).cost < part.normal(here, shared).cost
+            return part, torch.where(better, there, here)
+
+        return solve_in_chunks(len(problem), chunk, shared, inner, start)
 
     now = settled(local, shared)
     damping, status = 1e-3, Status.EXHAUSTED
@@ -91,16 +100,16 @@ def solve_joint(  # noqa: PLR0913  (a problem, where it starts, and when it ends
         total = lambda s, g, v=voters: float(s.cost[v].sum() + 0.5 * problem.shared_rows(g).square().sum())  # noqa: E731
         before = total(now, shared)
         history.append(before)
-        S, right = reduced(problem, now.local, shared, chunk, voters)
+        S, right, X = reduced(problem, now.local, shared, chunk, voters)
         S, right = S[index][:, index], right[index]
         moved = None
         for _ in range(TRIALS if len(index) else 0):
             system = S + torch.diag(damping * S.diagonal().clamp_min(1e-12) + 1e-9 * S.diagonal().amax())
-            step = torch.linalg.lstsq(system, right[:, None]).solution[:, 0].clamp(-0.5, 0.5)
+            step = torch.linalg.solve_ex(system, right)[0].nan_to_num(0.0).clamp(-0.5, 0.5)
             trial = shared.clone()
             trial[index] += step
             trial = problem.bounded(trial)
-            found = settled(now.local, trial)
+            found = settled(now.local, trial, now.local + following(X, trial - shared))
             if total(found, trial) < before:
                 moved = found, trial
                 break
@@ -120,19 +129,30 @@ def solve_joint(  # noqa: PLR0913  (a problem, where it starts, and when it ends
     )
 
 
+def following(X: Float[Tensor, "blocks P G1"], dg: Float[Tensor, "G"]) -> Float[Tensor, "P blocks"]:
+    """Step of the blocks dl = -V^-1 (gl + W dg), with X = V^-1 [W gl]; none where that means nothing."""
+    step = -(X[..., :-1] @ dg + X[..., -1])
+    return torch.where(step.isfinite().all(1, keepdim=True), step, 0.0).mT
+
+
 def reduced(
     problem: JointProblem, local: Tensor, shared: Tensor, chunk: int, voters: Tensor
-) -> tuple[Float[Tensor, "G G"], Float[Tensor, "G"]]:
-    """S and -(gg - W^T V^-1 gl) over the blocks `voters`, the shared parameters' own prior included."""
+) -> tuple[Float[Tensor, "G G"], Float[Tensor, "G"], Float[Tensor, "blocks P G1"]]:
+    """S, -(gg - W^T V^-1 gl) over the blocks `voters`, the shared parameters' own prior included; and V^-1 [W gl]."""
+    votes = torch.zeros(len(problem), dtype=local.dtype)
+    votes[voters] = 1.0
 
-    def part(cut: slice) -> tuple[Tensor, Tensor]:
-        which = voters[cut]
-        V, gl, W, H, gg = problem.take(which).coupled(local[:, which], shared)
+    def part(cut: slice) -> tuple[Tensor, Tensor, Tensor]:
+        V, gl, W, H, gg = problem.take(cut).coupled(local[:, cut].contiguous(), shared)
         factor = factorise(V, 1e-12 * V.diagonal(dim1=0, dim2=1).mT.amax(0) * torch.ones_like(gl))
         X = solve(factor, torch.cat([W, gl[:, None]], 1))
-        S = H.sum(-1) - torch.einsum("pgn,phn->gh", W, X[:, :-1])
-        return S[None], (-(gg.sum(-1) - torch.einsum("pgn,pn->g", W, X[:, -1])))[None]
+        # A block without finite numbers has no say; nought times such a number would be none either.
+        say = votes[cut] > 0
+        say &= X.isfinite().all(0).all(0) & H.isfinite().all(0).all(0) & gg.isfinite().all(0)
+        S = H[..., say].sum(-1) - torch.einsum("pgn,phn->gh", W[..., say], X[:, :-1, say])
+        right = -(gg[:, say].sum(-1) - torch.einsum("pgn,pn->g", W[..., say], X[:, -1, say]))
+        return S[None], right[None], X.movedim(-1, 0)
 
-    S, right = by_chunks(len(voters), chunk, part)
+    S, right, X = by_chunks(len(problem), chunk, part)
     J = torch.func.jacfwd(problem.shared_rows)(shared)
-    return S.sum(0) + J.mT @ J, right.sum(0) - J.mT @ problem.shared_rows(shared)
+    return S.sum(0) + J.mT @ J, right.sum(0) - J.mT @ problem.shared_rows(shared), X

@@ -163,7 +163,8 @@ def description(shown: Shown, accuracy: Accuracy) -> dict[str, Any]:
         "globals": {key: getattr(separation, key).tolist() for key in ("a", "n_s", "n_d", "f", "softness", "fresnel")},
         "ggx": separation.ggx,
         "M": separation.M.tolist(),
-        "ceiling": float(separation.ceiling) if bool(separation.ceiling.isfinite()) else None,
+        "materials": separation.materials.tolist(),
+        "ceilings": [value if math.isfinite(value) else None for value in separation.ceilings.tolist()],
         "flag_counts": count(separation.flags),
         "flag_values": {str(flag.name): int(flag) for flag in Flag},
         "accuracy": {

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -29,6 +29,8 @@ SMALLEST = 256
 """A level no longer than this is the last of its pyramid."""
 FLAG_BITS = 10
 """A half float holds whole numbers up to 2048: flags are stored in two parts of this many bits."""
+MATERIAL_BIT = 6
+"""Of the upper part: from here to the mask's bit it holds the material."""
 HALF_MAX = 60000.0
 
 
@@ -45,6 +47,7 @@ class Level:
     B: Float[Tensor, "height width"]
     flags: Int[Tensor, "height width"]
     mask: Bool[Tensor, "height width"]
+    material: Int[Tensor, "height width"]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -62,6 +65,7 @@ def full_level(separation: Separation) -> Level:
         B=separation.B,
         flags=separation.flags.to(torch.int64),
         mask=separation.mask,
+        material=separation.material,
     )
 
 
@@ -96,6 +100,7 @@ def halved(level: Level) -> Level:
         B=mean(level.B[None])[0] * mask,
         flags=torch.where(mask, flags, int(Flag.OUTSIDE_MASK)),
         mask=mask,
+        material=torch.where(mask, pad(level.material, _odd(level.material))[::2, ::2], 0),
     )
 
 
@@ -122,6 +127,7 @@ def stored(level: Level, scale: tuple[float, float]) -> Float[np.ndarray, "plane
     roots, lobes = scale
     low = (level.flags & (1 << FLAG_BITS) - 1).float()
     high = (level.flags >> FLAG_BITS).float() + (1 << FLAG_BITS) * level.mask.float()
+    high = high + (1 << MATERIAL_BIT) * level.material.float()
     channels = level.d.shape[1]
 
     def layer(k: int) -> Tensor:
@@ -147,15 +153,16 @@ def as_drawn(level: Level, scale: tuple[float, float]) -> Level:
         B=planes[0, 3] * scale[1],
         flags=level.flags,
         mask=level.mask,
+        material=level.material,
     )
 
 
 def relit(separation: Separation, level: Level, alpha: Float[Tensor, "3"]) -> Float[Tensor, "channels height width"]:
     """The picture that a level gives under one light: Eqs. 20 and 21 with w = a + B m."""
     unit, intensity = separation.unit_mix(alpha[None].to(level.d))
-    shared, whole = separation.globals, level.d + level.s
+    shared, whole = replace(separation, material=level.material).globals, level.d + level.s
     body = diffuse(mixed(unit, whole), length(shared.M, whole), shared)
-    shine = lobe_of(level.w, shared, unit, separation.ceiling)
+    shine = lobe_of(level.w, shared, unit, replace(separation, material=level.material).ceiling)
     return (body + shine[:, None])[0] * intensity * level.mask
 
 

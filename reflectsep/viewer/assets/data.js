@@ -112,5 +112,5 @@ function pixel_of(result, x, y) {
   }
   const bits = at(C, 3) + base * (high % base);
   const flags = Object.keys(about.flag_values).filter(name => bits & about.flag_values[name]);
-  return { x: x * level.factor, y: y * level.factor, d, s, w: [0, 1, 2].map(k => at(2 * C, k)), B: about.scale[1] * at(0, 3), flags, inside: high >= base };
+  return { x: x * level.factor, y: y * level.factor, d, s, w: [0, 1, 2].map(k => at(2 * C, k)), B: about.scale[1] * at(0, 3), flags, inside: high >= base, material: (high >> 6) & 3 };
 }

@@ -142,11 +142,15 @@ function set_pane(pane, about) {
   use_program(about.channels, on.length, SHOWN[pane.show][0]);
   gl.uniform3fv(places.alpha, [...on[0].alpha, ...(on[1] || on[0]).alpha]);
   gl.uniform1fv(places.power, [on[0].power, (on[1] || on[0]).power]);
-  gl.uniform4f(places.globals, state.ns || g.n_s, g.n_d, g.softness, g.fresnel);
+  gl.uniform3f(places.globals, g.n_d, g.softness, g.fresnel);
   gl.uniform1i(places.ggx, about.ggx ? 1 : 0);
   // Rows of M become columns: the shader multiplies from the left.
   gl.uniformMatrix3fv(places.M, false, about.M.flat());
-  gl.uniform1f(places.ceiling, about.ceiling ?? 1e30);
+  const kinds = [0, 1, 2, 3].map(k => Math.min(k, about.materials.length - 1));
+  // A chosen n_s stands for that of the first material; the others keep their ratio to it.
+  const gloss = (state.ns || g.n_s) / g.n_s;
+  gl.uniform1fv(places.exponents, kinds.map(k => gloss * about.materials[k][1]));
+  gl.uniform1fv(places.ceilings, kinds.map(k => about.ceilings[k] ?? 1e30));
   gl.uniform1f(places.root_scale, about.scale[0]);
   gl.uniform1f(places.lobe_scale, about.scale[1]);
   // Faders scale light, and light is the n_d-th power of the roots.

@@ -131,7 +131,7 @@ function about_result(about) {
   const size_text = level.factor > 1 ? `${about.width} x ${about.height}, here ${level.width} x ${level.height}` : `${about.width} x ${about.height}`;
   const rows = [
     ["result", about.name], ["object", about.object], ["model", about.model], ["made", about.created], ["size", `${size_text} pixels`],
-    ["n_s", round(g.n_s)], ["n_d", `${round(g.n_d, 4)} (${about.n_d_source})`], ["a", g.a.map(v => round(v)).join(", ")],
+    ["n_s", about.materials.map(m => round(m[1])).join(", ")], ["n_d", `${round(g.n_d, 4)} (${about.n_d_source})`], ["a", g.a.map(v => round(v)).join(", ")],
     ["f", round(g.f)], ["shadow softness", round(g.softness)], ["Fresnel share", round(g.fresnel)], ["lobe", about.ggx ? "GGX microfacets" : "power of a cosine"], ["white", `${round(about.white)} in the capture's units, at exposure 0`],
     ["stored as", `16-bit floats: basis lights ${error.psnr_db === null ? "exact" : error.psnr_db.toFixed(1) + " dB"} from the result, ${(100 * error.within_one).toFixed(2)} % of the values within one of 255 steps, at most ${error.largest}`],
     ...about.warnings.map(text => ["warning", text]),
@@ -156,8 +156,8 @@ function entered(c, g) {
 
 // Linear value of the whole picture at a pixel, the formula of the shader in double precision.
 function value_of(result, pixel) {
-  const about = PAGE.results[result], g = about.globals, n_s = state.ns || g.n_s;
-  const full = Math.max(size_of(about.M, pixel.w), 1e-6), size = Math.min(full, about.ceiling ?? 1e30);
+  const about = PAGE.results[result], g = about.globals, kind = pixel.material, n_s = (state.ns || g.n_s) / g.n_s * about.materials[kind][1];
+  const full = Math.max(size_of(about.M, pixel.w), 1e-6), size = Math.min(full, about.ceilings[kind] ?? 1e30);
   const power = (base, exponent) => base > 0 ? base ** exponent : 0;
   return pixel.d.map((d, c) => lights_on(result).reduce((sum, light) => {
     const f_d = power(state.loc, 1 / g.n_d), f_s = power(state.scat, 1 / g.n_d), s = pixel.s[c];

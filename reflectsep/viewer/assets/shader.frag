@@ -5,10 +5,11 @@ uniform sampler2DArray planes;    // per channel (d, B), per channel (s, low fla
 uniform sampler2DArray measured;  // one layer a light, sRGB codes
 uniform vec3 alpha[2];            // of lights of unit intensity
 uniform float power[2];           // their intensities
-uniform vec4 globals;             // n_s, n_d, softness, Fresnel share
+uniform vec3 globals;             // n_d, softness, Fresnel share
 uniform bool ggx;                 // the lobe of GGX microfacets, not a power
 uniform mat3 M;                   // inverse of the basis directions, transposed
-uniform float ceiling;            // largest |M w|
+uniform float exponents[4];       // n_s of every material
+uniform float ceilings[4];        // largest |M w| of every material
 uniform float root_scale;
 uniform float lobe_scale;         // of B
 uniform vec3 faders;              // of the specular, and of the roots of local diffuse and scattering
@@ -36,18 +37,18 @@ float positive_power(float base, float exponent) {
 
 // T(c): light that enters the body at the cosine c
 float entered(float c) {
-  float y = 0.5 * (c + sqrt(c * c + globals.z * globals.z)), rest = 1.0 - min(y, 1.0);
-  return y * (1.0 - globals.w * rest * rest * rest * rest * rest);
+  float y = 0.5 * (c + sqrt(c * c + globals.y * globals.y)), rest = 1.0 - min(y, 1.0);
+  return y * (1.0 - globals.z * rest * rest * rest * rest * rest);
 }
 
 float diffuse(vec3 roots, vec3 mix_) {
   float q = max(length(roots * M), 1e-6);
-  return positive_power(q * entered(dot(roots, mix_) / q), globals.y);
+  return positive_power(q * entered(dot(roots, mix_) / q), globals.x);
 }
 
 // off-specular value of w = a + B m under a light: Eq. 17, or the lobe of GGX microfacets
-float lobe(vec3 w, vec3 mix_) {
-  float n = globals.x, full = max(length(w * M), 1e-6), size = min(full, ceiling), u = dot(w, mix_) * size / full;
+float lobe(vec3 w, vec3 mix_, int kind) {
+  float n = exponents[kind], full = max(length(w * M), 1e-6), size = min(full, ceilings[kind]), u = dot(w, mix_) * size / full;
   if (!ggx) return positive_power(u, n);
   if (!(u > 0.0)) return 0.0;
   float base = 1.0 + 0.5 * n * (1.0 - min(u / size, 1.0)), least = 1.0 + 0.5 * n;
@@ -56,7 +57,7 @@ float lobe(vec3 w, vec3 mix_) {
 
 // Eqs. 20 and 21 of one channel under one light
 float value(vec3 d, vec3 s, float shine, vec3 mix_) {
-  float n_d = globals.y;
+  float n_d = globals.x;
 #if SHOW == 1
   return shine;
 #elif SHOW == 2
@@ -73,12 +74,12 @@ float value(vec3 d, vec3 s, float shine, vec3 mix_) {
 }
 
 // one channel under all lights, linear
-float channel(ivec2 p, int c, vec3 w) {
+float channel(ivec2 p, int c, vec3 w, int kind) {
   vec3 d = root_scale * texelFetch(planes, ivec3(p, c), 0).xyz;
   vec3 s = root_scale * texelFetch(planes, ivec3(p, CHANNELS + c), 0).xyz;
-  float sum = power[0] * value(d, s, lobe(w, alpha[0]), alpha[0]);
+  float sum = power[0] * value(d, s, lobe(w, alpha[0], kind), alpha[0]);
 #if LIGHTS == 2
-  sum += power[1] * value(d, s, lobe(w, alpha[1]), alpha[1]);
+  sum += power[1] * value(d, s, lobe(w, alpha[1], kind), alpha[1]);
 #endif
   return sum;
 }
@@ -86,10 +87,11 @@ float channel(ivec2 p, int c, vec3 w) {
 vec3 reflectance(ivec2 p) {
   vec4 w = texelFetch(planes, ivec3(p, 2 * CHANNELS), 0);
   if (w.w < flag_base) return vec3(0.0);
+  int kind = (int(w.w) >> 6) & 3;  // planes.MATERIAL_BIT
 #if CHANNELS == 1
-  return vec3(channel(p, 0, w.xyz));
+  return vec3(channel(p, 0, w.xyz, kind));
 #else
-  return vec3(channel(p, 0, w.xyz), channel(p, 1, w.xyz), channel(p, 2, w.xyz));
+  return vec3(channel(p, 0, w.xyz, kind), channel(p, 1, w.xyz, kind), channel(p, 2, w.xyz, kind));
 #endif
 }
 
