@@ -69,7 +69,7 @@ def hasten() -> None:
     """A few iterations wherever a pixel or the globals have many."""
     from reflectsep.fit import reflectance
 
-    reflectance.ROUNDS, reflectance.START_N_S = 1, reflectance.START_N_S[:1]
+    reflectance.ROUNDS = 1
 
 
 def main(words: list[str]) -> int:
