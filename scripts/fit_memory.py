@@ -1,4 +1,4 @@
-"""Memory and disk of a whole fit, stage by stage, with as few iterations as there can be.
+"""Memory and disk of a whole fit, stage by stage, with few iterations.
 
 `python scripts/fit_memory.py capture=FOLDER out=FOLDER [as_megapixels=24] [registration=all] [report=true]`
 
