@@ -1,7 +1,7 @@
 """What the stages of a fit take, by counts of pixels, lights, channels and frames.
 
-The seconds are those of one core of a server of 2023, from fits of a simulated wax between 64 x 64 and 320 x 320 pixels,
-in grey and in colour, with and without sweeps. On other machines they are wrong by one factor, which
+The seconds are those of one core of a server of 2023, from fits of a simulated wax between 64 x 64 and 320 x 320
+pixels, in grey and in colour, with and without sweeps. On other machines they are wrong by one factor, which
 `estimate.TimeLeft` finds as the run goes; what counts here is how the stages stand to each other.
 """
 
