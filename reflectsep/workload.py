@@ -1,8 +1,8 @@
 """What the stages of a fit take, by counts of pixels, lights, channels and frames.
 
-The seconds are those of one core of a server of 2023, from fits between 64 x 64 and 512 x 512 pixels, in grey and in
-colour, with and without sweeps. On other machines they are wrong by one factor, which `estimate.TimeLeft` finds as the
-run goes; what counts here is how the stages stand to each other.
+The seconds are those of one core of a server of 2023, from fits of a simulated wax between 64 x 64 and 320 x 320
+pixels, in grey and in colour, with and without sweeps. On other machines they are wrong by one factor, which
+`estimate.TimeLeft` finds as the run goes; what counts here is how the stages stand to each other.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from reflectsep.estimate import Part
 from reflectsep.fit.options import FitOptions
 from reflectsep.fit.sample import SAMPLE
 
-PIXEL_US = 60
+PIXEL_US = 50
 """Microseconds a pixel of a grey fit of few lights, all of its rounds; `_effort` says how it grows."""
-GLOBALS_US = 900
+GLOBALS_US = 1000
 """Of a pixel of the sample that the globals are fitted to."""
 
 
@@ -43,13 +43,13 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
     sweeps = [sweep for sweep in capture.sweeps if sweep.light in capture.names]
     parts = []
     if aligned:
-        pairs = 0.2 + (counts.lights - 1) * (1.0 + 37e-6 * counts.pixels)
+        pairs = 0.2 + (counts.lights - 1) * (0.03 + 4e-6 * counts.pixels)
         parts = [Part(name="alignment", label="alignment", expected_s=pairs, steps="even")]
         parts += [
             Part(
                 name=f"alignment {sweep.light} {sweep.direction}",
                 label="alignment",
-                expected_s=37e-6 * counts.pixels + 0.1 * values * sweep.count,
+                expected_s=10e-6 * counts.pixels + 0.03 * values * sweep.count,
                 steps="even",
             )
             for sweep in sweeps
@@ -68,7 +68,7 @@ def reading(capture: Capture, counts: Counts, *, aligned: bool, swept: bool) -> 
             Part(
                 name=f"sweep {sweep.light} {sweep.direction}: {step}",
                 label=f"sweeps: {step}",
-                expected_s=0.1 + 0.05 * values * sweep.count,
+                expected_s=0.05 + 0.04 * values * sweep.count,
                 kind="reading",
                 steps="even",
             )

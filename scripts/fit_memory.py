@@ -1,4 +1,4 @@
-"""Memory and disk of a whole fit, stage by stage, with as few iterations as there can be.
+"""Memory and disk of a whole fit, stage by stage, with few iterations.
 
 `python scripts/fit_memory.py capture=FOLDER out=FOLDER [as_megapixels=24] [registration=all] [report=true]`
 
@@ -14,7 +14,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 SAMPLED_S = 0.01
@@ -69,17 +68,8 @@ class Watch:
 def hasten() -> None:
     """A few iterations wherever a pixel or the globals have many."""
     from reflectsep.fit import reflectance
-    from reflectsep.solve.local import Termination
 
-    prepared = reflectance.prepare
-
-    def prepare(*given: object) -> object:
-        state = prepared(*given)  # pyright: ignore[reportArgumentType]
-        short = Termination(max_iterations=8)
-        joint = replace(state.effort.joint, max_iterations=2, inner=short)
-        return replace(state, effort=replace(state.effort, polish=short, joint=joint, minima=1, rounds=1, starts=1))
-
-    reflectance.prepare = prepare
+    reflectance.ROUNDS = 1
 
 
 def main(words: list[str]) -> int:
@@ -110,7 +100,7 @@ def main(words: list[str]) -> int:
         baseline=False,
         report=report,
         calibration=CalibrationSettings(registration=given.get("registration", "all")),  # pyright: ignore[reportArgumentType]
-        fit=FitSettings(globals_pixels=100),
+        fit=FitSettings(max_iterations=3),
     )
     before, watch = resident()[0], Watch()
     try:

@@ -122,25 +122,25 @@ def test_a_run_that_goes_as_expected_is_told_exactly(seconds, slowness):
 
 
 # Fits as they were timed: counts, sweeps and their frames, seconds of the alignment of pictures and of sweeps, of both
-# passes over the sweeps, and of the stages that follow.
+# passes over the sweeps, and of the stages that follow: globals, pixels, report.
 RUNS = {
     "grey, 96 x 96": (
-        Counts(size=9216, pixels=5211, lights=6, channels=1),
+        Counts(size=9216, pixels=5029, lights=6, channels=1),
         (3, 44),
-        (5.5, 0.5, 0.3, 0.3),
-        [3.4, 4.2, 1.7, 1.9, 1.1, 1.1, 1.0, 0.5, 0.4, 0.4, 11.3],
+        (0.3, 0.3, 0.2, 0.5),
+        [6.5, 0.5, 9.6],
     ),
-    "photographs": (
-        Counts(size=174080, pixels=36528, lights=8, channels=3),
+    "colour, no sweeps": (
+        Counts(size=25600, pixels=13967, lights=12, channels=3),
         (0, 0),
-        (16.3, 0, 0, 0),
-        [10.6, 13.9, 7.1, 11.8, 4.8, 3.9, 3.8, 2.6, 2.4, 2.4, 20.5],
+        (0.9, 0, 0, 0),
+        [10.1, 1.3, 10.4],
     ),
-    "colour, 512 x 512": (
-        Counts(size=262144, pixels=143007, lights=6, channels=3),
-        (3, 31),
-        (31.6, 24.0, 3.7, 6.2),
-        [10.3, 4.7, 48.9, 25.5, 27.8, 15.4, 26.5, 14.0, 12.1, 9.7, 10.2],
+    "colour, 320 x 320": (
+        Counts(size=102400, pixels=55858, lights=6, channels=3),
+        (3, 141),
+        (1.4, 5.8, 5.0, 6.3),
+        [5.2, 5.4, 15.9],
     ),
 }
 
@@ -153,10 +153,7 @@ def test_runs_that_were_timed_are_told_within_a_factor_of_two(name, slowness):
     capture: Any = SimpleNamespace(
         names=lights, sweeps=[SimpleNamespace(light=name, direction="x", count=frames) for name in lights]
     )
-    names = ["globals", "globals", "pixels", "joint fit"]
-    names += ["shadow edges", "neighbourhood 1 of 2", "neighbourhood 2 of 2"] if sweeps else []
-    rounds = len(took) - len(names) - 1
-    names += [f"smooth lobes {i + 1} of {rounds}" for i in range(rounds)] + ["report"]
+    names = ["globals", "pixels", "report"]
     before = [("alignment", pictures_s)]
     before += [(f"alignment {light} x", drifts_s / sweeps) for light in lights] + [("pictures", 0.5)]
     before += [(f"sweep {light} x: passage", passages_s / sweeps) for light in lights]
@@ -167,16 +164,14 @@ def test_runs_that_were_timed_are_told_within_a_factor_of_two(name, slowness):
     left.expect([*ahead, *solving(counts, FitOptions(), swept=sweeps > 0), *reporting(counts, sweeps)])
     seen = []
     for stage, seconds in [*before, *zip(names, took, strict=True)]:
-        even = (stage, seconds) in before or stage == "globals"
         for step in range(20):
-            # An iteration is said to have twenty steps at most and converges after seven.
-            left(stage, step if even else step * 7 // 20, 20)
+            left(stage, step, 20)
             seen.append((clock.at_s, left.left_s()))
             clock.at_s += slowness * seconds / 20
         left(stage, 20, 20)
         seen.append((clock.at_s, left.left_s()))
     begun_s = 0.1 * clock.at_s if slowness != 1.0 else 0.0  # another machine's speed shows as the run goes
-    share = within_two(seen, from_s=begun_s)
+    share = within_two(seen, from_s=begun_s, skip_s=3.0)  # which are called a few seconds
     print(f"{name}, slowness {slowness:g}: within a factor of two for {100 * share:.0f} % of the time")
     assert share >= (0.95 if slowness == 1.0 else 0.75)
 

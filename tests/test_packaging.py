@@ -88,7 +88,6 @@ def test_there_is_one_script_a_job():
             "benchmark",
             "fit_memory",
             "hole_fillings",
-            "scaling",
             "seams",
             "shared_speed",
             "sweep_speed",

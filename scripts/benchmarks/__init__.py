@@ -1,1 +1,1 @@
-"""What `scripts/benchmark.py` measures: the common problem, the yardstick in C++, and the competitors."""
+"""The fit's solver, and what it is measured against."""

@@ -1,4 +1,4 @@
-"""The hand-written C++ kernel, compiled here, behind plain functions."""
+"""The hand-written C++ solver, compiled here, behind a plain function."""
 
 from __future__ import annotations
 
@@ -12,112 +12,71 @@ import tempfile
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from reflectsep.kernel.problem import Lobe, PixelProblem
-from reflectsep.kernel.search import Scan
-from reflectsep.solve.joint import ReducedSystem, shared_step
+from reflectsep.fit.problem import globals_of, log_size
 
-from .problem import FLOOR, ITERATIONS, TOLERANCE, Case
+from .problem import END, Case
 
-FOLDER = Path(__file__).parent
-FAST = ("-O3", "-march=native", "-ffast-math", "-mprefer-vector-width=512")
+SOURCE = Path(__file__).with_name("yardstick.cpp")
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-std=c++17", "-Wno-psabi")
+WIDTH = 8
+"""Pixels in a vector."""
 
 
-class NotInstalled(Exception):  # noqa: N818  (no error: the table says so)
+class NotInstalled(Exception):  # noqa: N818  (no error: whoever measures says so)
     """What is missing, and how to install it."""
 
 
 @functools.cache
-def library(source: str, lights: int, flags: tuple[str, ...], links: tuple[str, ...] = ()) -> ctypes.CDLL:
-    """The shared library of one source, compiled if its text or flags are new."""
+def library(lights: int, channels: int) -> ctypes.CDLL:
+    """The shared library, compiled if its text or flags are new."""
     compiler = shutil.which(os.environ.get("CXX", "g++"))
     if compiler is None:
         raise NotInstalled("no C++ compiler: apt-get install g++")
-    text = (FOLDER / source).read_text()
-    key = hashlib.sha256(repr((text, lights, flags, compiler)).encode()).hexdigest()[:16]
+    sizes = [f"-DLIGHTS={lights}", f"-DCHANNELS={channels}", f"-DWIDTH={WIDTH}"]
+    key = hashlib.sha256(repr((SOURCE.read_text(), sizes, FLAGS, compiler)).encode()).hexdigest()[:16]
     folder = Path(tempfile.gettempdir()) / f"reflectsep-benchmark-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    target = folder / f"{Path(source).stem}-{key}.so"
+    target = folder / f"yardstick-{key}.so"
     if not target.exists():
         unfinished = target.with_suffix(f".{os.getpid()}")
-        command = [compiler, *flags, f"-DLIGHTS={lights}", "-shared", "-fPIC", str(FOLDER / source), "-o"]
-        run = subprocess.run([*command, str(unfinished), *links], capture_output=True, text=True, check=False)
+        command = [compiler, *FLAGS, *sizes, "-shared", "-fPIC", str(SOURCE), "-o", str(unfinished)]
+        run = subprocess.run(command, capture_output=True, text=True, check=False)
         if run.returncode:
-            raise NotInstalled(f"{source} does not compile: {(run.stderr.splitlines() or ['?'])[0]}")
+            raise NotInstalled(f"{SOURCE.name} does not compile: {(run.stderr.splitlines() or ['?'])[0]}")
         unfinished.replace(target)
     return ctypes.CDLL(str(target))
 
 
-def pointer(values: Tensor) -> ctypes.c_void_p:
-    """Of a contiguous tensor."""
-    if not values.is_contiguous():
-        raise ValueError(f"a tensor of shape {tuple(values.shape)} is not contiguous")
-    return ctypes.c_void_p(values.data_ptr())
-
-
-def constants(p: PixelProblem, lobe: Lobe) -> Tensor:
+def constants(case: Case) -> Float[Tensor, "values"]:
     """The C++ struct `Shared`."""
-    alpha = p.alpha.double()
-    parts = [alpha.flatten(), alpha @ lobe.a.double(), p.light_weight.double(), torch.tensor([lobe.n_s]), lobe.a]
-    return torch.cat([part.double() for part in parts])
+    p, g = case.problem, globals_of(case.shared, case.problem.obs)
+    if not g.ggx or p.huber is None:
+        raise ValueError("the yardstick has the lobe of GGX microfacets and Huber's loss alone")
+    size = log_size(case.shared, p.obs)
+    near = 0.0 if p.neighbours is None else 0.5 / float(size.exp())
+    single = [g.n_s, g.f, g.softness, g.fresnel, g.n_d, size, p.height_spread, p.huber, near]
+    parts = [p.obs.alpha, p.weight, g.M, g.a, torch.tensor([float(value) for value in single])]
+    return torch.cat([part.double().flatten() for part in parts])
 
 
-def _kernel(case: Case) -> ctypes.CDLL:
-    return library("yardstick.cpp", len(case.problem.images), FAST)
+def values(case: Case) -> Float[Tensor, "values pixels"]:
+    """What the C++ struct `Pixel` holds, a row each."""
+    p, obs = case.problem, case.problem.obs
+    around = obs.images.new_zeros(9, len(p))
+    if p.neighbours is not None:
+        around = torch.cat([p.neighbours.R, p.neighbours.vector])
+    return torch.cat([part.double().flatten(0, -2) for part in (obs.images, obs.s, obs.clipped, around)]).contiguous()
 
 
-def local_fit(case: Case) -> Tensor:
-    """LM from the case's start; (4, pixels)."""
-    p, local = case.problem, case.start.clone()
-    cost, c = torch.empty(len(p)), constants(p, case.lobe).float()
-    _kernel(case).local_fit(
-        *(ctypes.c_int64(len(p)), pointer(p.images), pointer(p.s), pointer(c)),
-        *(ctypes.c_float(TOLERANCE), ctypes.c_float(FLOOR), ITERATIONS, pointer(local), pointer(cost)),
-    )
-    return local
-
-
-def whole_fit(case: Case) -> Tensor:
-    """Search over B and polish; (4, pixels)."""
-    p, offsets = case.problem, torch.tensor(Scan().offsets)
-    local, cost, c = torch.empty_like(case.start), torch.empty(len(p)), constants(p, case.lobe).float()
-    _kernel(case).whole_fit(
-        *(ctypes.c_int64(len(p)), pointer(p.images), pointer(p.s), pointer(c), pointer(offsets), len(offsets)),
-        *(ctypes.c_float(TOLERANCE), ctypes.c_float(FLOOR), ITERATIONS, pointer(local), pointer(cost)),
-    )
-    return local
-
-
-def joint_fit(case: Case, local: Tensor, lobe: Lobe, tolerance: float, limit: int) -> tuple[Tensor, Lobe, int]:
-    """Pixels and globals by the Schur complement: the loop of `kernel.joint` about the C++ pass."""
-    p, here, spare = case.problem, local.clone(), torch.empty_like(local)
-
-    def run(old: Lobe, new: Lobe) -> tuple[float, ReducedSystem]:
-        sums, step = torch.empty(15, dtype=torch.float64), (new.shared - old.shared).float()
-        before, after = constants(p, old).float(), constants(p, new).float()
-        _kernel(case).joint_pass(
-            *(ctypes.c_int64(len(p)), pointer(p.images), pointer(p.s), pointer(before), pointer(after), pointer(step)),
-            *(ctypes.c_float(TOLERANCE), ctypes.c_float(FLOOR), pointer(here), pointer(spare), pointer(sums)),
-        )
-        S = torch.zeros(4, 4, dtype=torch.float64)
-        S[tuple(torch.triu_indices(4, 4))] = sums[1:11]
-        return float(sums[0]), ReducedSystem(S + S.triu(1).T, sums[11:])
-
-    cost, system = run(lobe, lobe)
-    here, spare, mu, quiet, passes = spare, here, 1e-4, 0, 1
-    for _ in range(limit):
-        while mu < 1e8:
-            moved = lobe.moved(lobe.shared + shared_step(system, mu, None).to(lobe.a))
-            trial, found = run(lobe, moved)
-            passes += 1
-            if trial < cost:
-                break
-            mu *= 8.0
-        else:
-            break
-        quiet = quiet + 1 if cost - trial <= tolerance * cost else 0
-        here, spare, lobe, cost, system, mu = spare, here, moved, trial, found, max(mu * 0.2, 1e-9)
-        if quiet >= 2:
-            break
-    return here, lobe, passes
+def solve(case: Case) -> tuple[Float[Tensor, "P pixels"], Float[Tensor, "pixels"]]:
+    """Where every pixel ends, and its cost."""
+    lights, channels, pixels = case.problem.obs.images.shape
+    local, cost = case.start.double().contiguous().clone(), torch.empty(pixels, dtype=torch.float64)
+    rows, shared = values(case), constants(case)
+    at = [ctypes.c_void_p(tensor.data_ptr()) for tensor in (rows, shared, local, cost)]
+    end = (ctypes.c_double(END.tolerance), ctypes.c_int64(END.max_iterations))
+    library(lights, channels).solve_pixels(ctypes.c_int64(pixels), at[0], at[1], *end, at[2], at[3])
+    return local, cost
