@@ -143,7 +143,7 @@ def test_what_two_tiles_find_is_mixed_where_they_overlap(whole, plan):
 def test_a_value_that_is_none_has_no_say_outside_of_the_object(whole, plan):
     parts = cut_up(whole, plan)
     for part in parts:
-        part.B_sd[:, ~part.mask] = torch.nan
+        part.B_sd[~part.mask] = torch.nan
     assert join("1234", parts, SIZE, plan).B_sd.isfinite().all()
 
 
