@@ -134,5 +134,6 @@ def reduced(
         return S[None], (-(gg.sum(-1) - torch.einsum("pgn,pn->g", W, X[:, -1])))[None]
 
     S, right = by_chunks(len(voters), chunk, part)
-    J = torch.func.jacfwd(problem.shared_rows)(shared)
+    # Forward mode may answer in double precision where single came in.
+    J = torch.func.jacfwd(problem.shared_rows)(shared).to(shared.dtype)
     return S.sum(0) + J.mT @ J, right.sum(0) - J.mT @ problem.shared_rows(shared)
