@@ -10,7 +10,7 @@ from torch import Tensor
 from reflectsep.data import Fit, PhotometricStack, Scattering
 from reflectsep.fit.problem import ALPHA, Neighbours, Observations, PixelProblem
 from reflectsep.flags import Flag, mark
-from reflectsep.model import Globals, reflectance
+from reflectsep.model import Globals, lobe_of, lobe_vector, mixed, reflectance
 from reflectsep.synth.paper import PaperObject, PaperTruth, paper_alpha, paper_picture, paper_rig, paper_truth
 
 
@@ -113,6 +113,113 @@ def small_case() -> PaperCase:
 def without_vectors() -> Callable[[PaperCase], PhotometricStack]:
     """The stack of a case as if only alpha were known."""
     return lambda case: replace(case.stack, light_vectors=None)
+
+
+@dataclass(frozen=True)
+class ModelCase:
+    """Pictures made by the model itself under known globals, noise added, and what is behind them."""
+
+    stack: PhotometricStack
+    scattering: Scattering
+    shared: Globals
+    d: Tensor
+    B: Tensor
+    specular: Tensor
+    """(lights, height, width)."""
+    heldout: Tensor
+    heldout_pictures: Tensor
+    sigma: float
+
+    def found(self, fit: Fit) -> tuple[Globals, Tensor, Tensor, Tensor]:
+        """Globals, d, s and B of a fit, in double precision."""
+        g = Globals(
+            a=fit.a.double(),
+            n_s=fit.n_s.double(),
+            n_d=float(fit.n_d),
+            f=fit.f.double(),
+            softness=fit.softness.double(),
+            fresnel=fit.fresnel.double(),
+            ggx=fit.ggx,
+            M=self.shared.M,
+        )
+        return g, fit.d.double(), fit.s[:3].double(), fit.B.double()
+
+    def specular_error(self, fit: Fit) -> float:
+        """Of the off-specular part of all pictures, relative to its norm."""
+        g, d, s, B = self.found(fit)
+        off = lobe_of(lobe_vector(d, s, B, g), g, self.stack.alpha.double()) - self.specular
+        return float(off.norm() / self.specular.norm())
+
+    def psnr(self, fit: Fit) -> float:
+        """Of a relit picture that the fit did not see, in dB below the brightest value."""
+        g, d, s, B = self.found(fit)
+        off = reflectance(d, B, g, s=s, alpha=self.heldout) - self.heldout_pictures
+        return float(-10 * (off.square().mean() / self.heldout_pictures.amax().square()).log10())
+
+
+def make_model_case(  # noqa: PLR0913
+    *,
+    size=32,
+    lights=7,
+    channels=1,
+    ggx=True,
+    n_s=25.0,
+    f=0.4,
+    softness=0.08,
+    fresnel=0.7,
+    n_d=1.0,
+    noise=0.002,
+    scattering=0.19,
+) -> ModelCase:
+    """A bumpy surface with highlights in the mirror direction; `noise`: of the brightest value."""
+    rig = paper_rig(lights)
+    truth = paper_truth(PaperObject(size=size, channels=channels, n_d=n_d, scattering=scattering), rig)
+    everything = paper_alpha((*rig.lights, *rig.heldout))
+    alpha, heldout = everything[:lights], everything[lights:]
+    vectors = torch.tensor([light.direction for light in rig.lights], dtype=torch.float64)
+    number = lambda value: torch.tensor(value, dtype=torch.float64)  # noqa: E731
+    shared = Globals(
+        a=truth.a,
+        n_s=number(n_s),
+        n_d=n_d,
+        f=number(f),
+        softness=number(softness),
+        fresnel=number(fresnel),
+        ggx=ggx,
+        M=torch.linalg.inv(vectors[:3]),
+    )
+    turned = mixed(shared.M, (truth.d + (1 - f) * truth.s).mean(1))
+    B = 2 * 0.91 * turned[2] / turned.square().sum(0)
+    clean = reflectance(truth.d, B, shared, s=truth.s, alpha=everything)
+    sigma = noise * float(clean.max())
+    rough = torch.randn(clean[:lights].shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mask = truth.surface.mask
+    stack = PhotometricStack(
+        names=tuple(light.name for light in rig.lights),
+        images=(clean[:lights] + sigma * rough).float(),
+        saturated=torch.zeros(rough.shape, dtype=torch.bool),
+        mask=mask,
+        alpha=alpha.float(),
+        light_vectors=vectors.float(),
+        view=torch.tensor([0.0, 0.0, 1.0]),
+        flags=mark(torch.zeros(mask.shape, dtype=torch.int32), ~mask, Flag.OUTSIDE_MASK),
+    )
+    swept = Scattering(
+        root=mixed(alpha, truth.s).float(),
+        measured=tuple(k < 3 for k in range(lights)),
+        n_d=n_d,
+        n_d_sd=0.0,
+        n_d_source="fixed",
+        flags=torch.zeros(mask.shape, dtype=torch.int32),
+    )
+    specular = lobe_of(lobe_vector(truth.d, truth.s, B, shared), shared, alpha)
+    return ModelCase(stack, swept, shared, truth.d, B, specular, heldout, clean[lights:], sigma)
+
+
+@pytest.fixture(scope="session")
+def model_case() -> Callable[..., ModelCase]:
+    """`make_model_case`."""
+    return make_model_case
 
 
 def make_random_problem(  # noqa: PLR0913
