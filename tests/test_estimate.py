@@ -18,7 +18,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 from time_left import within_two
 
-
 LEARNT = Learnt(shared=(0.0,) * 8, order=(), covariance=(), noise=0.01)
 
 

@@ -88,6 +88,10 @@ def solve_joint(  # noqa: PLR0913  (a problem, where it starts, and when it ends
     iteration = 0
     for iteration in range(1, end.max_iterations + 1):
         voters = now.cost.argsort()[: max(1, int(trim * len(problem)))].sort().values
+        voters = voters[now.cost[voters].isfinite()]
+        if len(voters) == 0:
+            status = Status.FAILED
+            break
         total = lambda s, g, v=voters: float(s.cost[v].sum() + 0.5 * problem.shared_rows(g).square().sum())  # noqa: E731
         before = total(now, shared)
         history.append(before)

@@ -157,7 +157,7 @@ class ModelCase:
         return float(-10 * (off.square().mean() / self.heldout_pictures.amax().square()).log10())
 
 
-def make_model_case(  # noqa: PLR0913
+def make_model_case(
     *,
     size=32,
     lights=7,
@@ -222,7 +222,7 @@ def model_case() -> Callable[..., ModelCase]:
     return make_model_case
 
 
-def make_random_problem(  # noqa: PLR0913
+def make_random_problem(
     kind=PixelProblem,
     *,
     channels=1,

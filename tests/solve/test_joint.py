@@ -153,6 +153,15 @@ def test_iterations_are_limited_and_reported():
     assert len(found.history) == 2
 
 
+def test_blocks_without_a_finite_cost_have_no_say():
+    problem, _ = decays(blocks=40)
+    problem.y[2, 7] = torch.nan
+    found = solved(problem, trim=0.9)
+    torch.testing.assert_close(found.shared[:2], TRUTH[:2], rtol=1e-5, atol=1e-5)
+    problem.y[0] = torch.nan
+    assert solved(problem).status == Status.FAILED
+
+
 def test_a_solve_of_no_blocks_is_refused():
     problem, _ = decays()
     with pytest.raises(ValueError, match="no blocks"):

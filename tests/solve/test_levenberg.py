@@ -93,6 +93,27 @@ def test_a_block_that_no_step_helps_fails_where_it_was():
     torch.testing.assert_close(found.local, start, rtol=0, atol=0)
 
 
+@dataclass(frozen=True)
+class Cliff(Valleys):
+    """A bowl whose slope is no number where it is deepest, beyond a cliff at x < 0.1."""
+
+    def normal(self, local, shared):
+        eye = torch.eye(2, dtype=torch.float64)[..., None].expand(2, 2, len(self))
+        beyond = local[0] < 0.1
+        cost = 1.0 + 0.5 * local.square().sum(0)
+        return Normal(torch.where(beyond, 0.5, cost), torch.where(beyond, torch.nan, local), eye)
+
+
+def test_no_step_leads_to_where_there_is_no_slope():
+    problem, start = valleys()
+    found = solve_blocks(Cliff(problem.a, problem.b), start.abs() + 0.2, NOTHING, Termination(max_iterations=100))
+    assert found.local.isfinite().all()
+    beyond = solve_blocks(Cliff(problem.a, problem.b), 0.0 * start, NOTHING, Termination())
+    assert (beyond.status == int(Status.FAILED)).all()
+    assert (found.local[0] >= 0.1).all()
+    assert (found.cost < 1.0 + 0.5 * (start.abs() + 0.2).square().sum(0)).all()
+
+
 def test_a_block_does_not_depend_on_the_others():
     problem, start = valleys()
     end = Termination(tolerance=1e-10, max_iterations=200)
