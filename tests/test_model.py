@@ -131,7 +131,7 @@ def test_lights_with_a_sweep_of_their_own_are_lit_by_it():
 
 
 def test_the_body_is_transmitted_light_of_its_cosine():
-    d, s, B, alpha = some_pixels()
+    d, s, _, alpha = some_pixels()
     shared = some_globals(softness=one(0.2), fresnel=one(0.8), n_d=1.0)
     normal = torch.einsum("xk,kcp->xcp", shared.M, d + s)
     q = normal.norm(dim=0)

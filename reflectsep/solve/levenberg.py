@@ -115,7 +115,7 @@ def solve_blocks(problem: Problem, local: Float[Tensor, "P blocks"], shared: Ten
         new = problem.normal(here + step, shared)
         gain = (at.cost - new.cost) / foretold
         # False for what is not a number; a cost may be finite where its slope is none.
-        better = (gain > ACCEPTED_GAIN) & new.g.isfinite().all(0)
+        better = (gain > ACCEPTED_GAIN) & new.g.isfinite().all(0) & new.V.isfinite().flatten(0, 1).all(0)
         ended = better & (at.cost - new.cost <= end.tolerance * at.cost)
         # At rest: not even the linear model promises a decrease that counts.
         ended |= foretold <= 0.1 * end.tolerance * at.cost

@@ -21,6 +21,7 @@ sys.path.insert(0, str(SCRIPTS))
 
 from benchmarks import yardstick  # noqa: E402
 from benchmarks.problem import FLOOR, ITERATIONS, TOLERANCE, WITHIN, make_case, true_cost  # noqa: E402
+
 from reflectsep.kernel.compiling import Speed  # noqa: E402
 from reflectsep.kernel.joint import Passes  # noqa: E402
 from reflectsep.kernel.local import solve_pixels  # noqa: E402

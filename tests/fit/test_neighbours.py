@@ -143,7 +143,7 @@ def test_the_likelihood_is_that_of_a_normal_distribution():
     said = Messages(vectors(), plus_spread(covariances(size=0.1), 1.0))
     mean, covariance = vectors().flip(1), plus_spread(covariances(size=0.2).flip(1), 1.0)
     normal = torch.distributions.MultivariateNormal(mean.mT, full(covariance) + full(said.covariance))
-    expected = normal.log_prob(said.mean.mT) + 1.5 * torch.log(torch.tensor(2 * torch.pi))
+    expected = normal.log_prob(said.mean.mT) + 1.5 * torch.log(torch.tensor(2 * torch.pi, dtype=torch.float64))
     distance = -2 * (expected + 0.5 * torch.logdet(normal.covariance_matrix))
     assert 0.1 < float(distance.max()) < 25
     assert likelihood(said, mean, covariance) == pytest.approx(float(expected.mean()), rel=1e-9)
@@ -200,15 +200,15 @@ def test_messages_do_not_hand_back_what_the_neighbours_said(random_problem):
     alone = messages(problem, local, shared)
     known = (alone.covariance[[0, 3, 5]] < 1e-3).all(0)
     assert int(known.sum()) >= 8
-    # Expected elsewhere by about its own standard deviation, and as surely: everything near the optimum is linear.
+    # Expected elsewhere by about a tenth of its own standard deviation, and as surely: everything near the optimum is linear.
     sd = alone.covariance[[0, 3, 5]].sqrt()
-    near = Neighbours(vector=alone.mean + sd, R=upper_root(inverse(plus_spread(alone.covariance, 1e-4))))
+    near = Neighbours(vector=alone.mean + 0.1 * sd, R=upper_root(inverse(plus_spread(alone.covariance, 1e-4))))
     pulled = replace(problem, neighbours=near)
     there = solve_blocks(pulled, local, shared, Termination(tolerance=1e-14, max_iterations=200)).local
     said = messages(pulled, there, shared)
     held = messages(replace(problem, neighbours=None), there, shared)
     off = lambda m: ((m.mean - alone.mean).abs() / sd)[:, known]  # noqa: E731
-    assert float(off(held).median()) > 0.2  # the pixels did move
+    assert float(off(held).median()) > 0.02  # the pixels did move
     assert float(off(said).median()) < 0.25 * float(off(held).median())
     ratio = (said.covariance / alone.covariance)[[0, 3, 5]][:, known]
     assert float((ratio.log().abs()).median()) < 0.05

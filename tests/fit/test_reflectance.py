@@ -169,7 +169,7 @@ def quick_fit(model_case):
 
 
 def test_stages_are_those_that_are_expected(quick_fit):
-    case, _, stages = quick_fit
+    _, _, stages = quick_fit
     counts = Counts(size=256, pixels=256, lights=7, channels=1)
     for part in solving(counts, FitOptions(), swept=True):
         shares = [done / total for stage, done, total in stages if stage == part.name]
@@ -179,7 +179,7 @@ def test_stages_are_those_that_are_expected(quick_fit):
 
 
 def test_flags_name_what_the_fit_noticed(quick_fit):
-    case, fit, _ = quick_fit
+    _, fit, _ = quick_fit
     shadow = (fit.flags & int(Flag.ATTACHED_SHADOW)) > 0
     assert torch.equal(shadow, ((fit.d + fit.s[:3]).mean(1) < 0).any(0))
     outlier = (fit.flags & int(Flag.SHADOW_OR_OUTLIER)) > 0
