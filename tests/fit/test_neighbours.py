@@ -200,7 +200,7 @@ def test_messages_do_not_hand_back_what_the_neighbours_said(random_problem):
     alone = messages(problem, local, shared)
     known = (alone.covariance[[0, 3, 5]] < 1e-3).all(0)
     assert int(known.sum()) >= 8
-    # Expected elsewhere by about a tenth of its own standard deviation, and as surely: everything near the optimum is linear.
+    # Expected a tenth of a standard deviation off, and as surely: everything near the optimum is linear.
     sd = alone.covariance[[0, 3, 5]].sqrt()
     near = Neighbours(vector=alone.mean + 0.1 * sd, R=upper_root(inverse(plus_spread(alone.covariance, 1e-4))))
     pulled = replace(problem, neighbours=near)
