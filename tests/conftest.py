@@ -16,10 +16,11 @@ settings.register_profile("reflectsep", deadline=None)
 settings.load_profile("reflectsep")
 
 
-def make_result(*, size=64, channels=3, n_d=1.2, softness=0.2, crest=0.85, known=True, unit=1.0):
+def make_result(*, size=64, channels=3, n_d=1.2, softness=0.1, fresnel=0.5, f=0.7, known=True, unit=1.0, ggx=True):
     """A result whose parameters are those of a bumpy surface; a disc of it is the object.
 
-    `unit` scales the pictures, as another camera's units would.
+    `unit` scales the pictures, as another camera's units would. Where the lights are unknown (`known`) the lobe is the
+    paper's power and there is no Fresnel term.
     """
     rig = paper_rig(6)
     truth = paper_truth(PaperObject(size=size, channels=channels, n_d=n_d), rig)
@@ -31,6 +32,8 @@ def make_result(*, size=64, channels=3, n_d=1.2, softness=0.2, crest=0.85, known
     vectors = torch.tensor([light.direction for light in rig.lights]) * intensity[:, None]
     alpha = torch.linalg.solve(vectors[:3].mT, vectors.mT).mT if known else paper_alpha(rig.lights).float()
     root = unit ** (1.0 / n_d)
+    # The lobe turns with the mean of the channels' d.
+    B = (1.0 / (1.0 / truth.B).mean(0)).float()
     residual = 0.01 * unit * torch.randn(6, channels, size, size, generator=torch.Generator().manual_seed(1)) * mask
     stack = PhotometricStack(
         names=tuple(light.name for light in rig.lights),
@@ -47,15 +50,17 @@ def make_result(*, size=64, channels=3, n_d=1.2, softness=0.2, crest=0.85, known
         a=truth.a.float() * unit ** (1.0 / truth.n_s),
         n_s=torch.tensor(truth.n_s),
         n_d=torch.tensor(n_d),
+        f=torch.tensor(f),
         softness=torch.tensor(softness),
-        crest=torch.tensor(crest * unit ** (1.0 / truth.n_s)),
+        fresnel=torch.tensor(fresnel if known else 0.0),
+        ggx=ggx and known,
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=truth.d.float() * root * mask,
         s=s,
-        B=truth.B.float() * unit ** (1.0 / truth.n_s) / root * mask,
+        B=B * unit ** (1.0 / truth.n_s) / root * mask,
         d_sd=torch.zeros_like(truth.d).float(),
-        B_sd=torch.zeros_like(truth.B).float(),
+        B_sd=torch.zeros_like(B),
         residual=residual,
         intensity=intensity if known else torch.ones(6),
         flags=flags,

@@ -190,7 +190,7 @@ def test_what_is_not_ours_is_not_overwritten_even_when_asked(capture, tmp_path, 
     [
         ("fit capture=wax fit.n_ss=3", "fit.n_ss: no such setting; did you mean fit.n_s?"),
         ("fit capture=wax fit.n_s=-1", "fit.n_s=-1.0: must be above 0"),
-        ("fit capture=wax fit.lobe=dual", "fit.lobe=dual: expected auto"),
+        ("fit capture=wax fit.lobe=dual", "fit.lobe=dual: expected ggx or power"),
         ("fit capture=wax fit.robust=cauchy", "fit.robust=cauchy: expected huber or none"),
         ("simulate object.preset=glass", "object.preset=glass: expected wax, pudding, plastic, marble, skin or turtle"),
         ("simulate rig.lights=3 rig.sweeps=4", "rig.sweeps=4: must be at most rig.lights=3"),

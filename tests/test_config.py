@@ -60,7 +60,7 @@ def test_impossible_settings_say_what_is_possible(make, words):
 
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_every_number_is_taken_exactly_where_it_is_within_bounds(n_s):
-    possible = 0 < n_s <= 1000
+    possible = 0 < n_s <= 5000
     try:
         assert config.FitSettings(n_s=n_s).n_s == n_s
     except SettingsError:

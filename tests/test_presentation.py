@@ -35,6 +35,12 @@ def expected(saved, job, curve):
     }
 
 
+def steps_off(found, pixels):
+    """Most steps of the codes between two pictures: a power's last bit may turn a rounding."""
+    assert found.dtype == pixels.dtype
+    return int(np.abs(found.astype(int) - pixels).max())
+
+
 def test_a_png_sequence_is_the_relit_pictures(saved, tmp_path):
     job = orbit_job(saved, tmp_path / "orbit", format="png", exposure_ev=-1.0)
     steps = []
@@ -43,7 +49,7 @@ def test_a_png_sequence_is_the_relit_pictures(saved, tmp_path):
     assert steps == [("relight", k, 4) for k in (1, 2, 3, 4)]
     for name, pixels in expected(saved, job, tone).items():
         found = imagecodecs.png_decode((tmp_path / "orbit" / f"{name}.png").read_bytes())
-        assert np.array_equal(found, pixels)
+        assert steps_off(found, pixels) <= 1
     assert (tmp_path / "orbit" / "relit.json").is_file()
     with pytest.raises(ResultError, match="exists"):
         run_relight(job)
@@ -58,7 +64,7 @@ def test_the_frames_of_a_film_are_the_relit_pictures(saved, tmp_path):
     with av.open(str(tmp_path / "orbit" / "film.mkv")) as container:
         found = [frame.to_ndarray(format="gbrp16le") for frame in container.decode(video=0)]
     for pixels, back in zip(expected(saved, job, tone_16).values(), found, strict=True):
-        assert np.array_equal(back, pixels)
+        assert steps_off(back, pixels) <= 1
     run_relight(orbit_job(saved, tmp_path / "orbit", format="mp4", overwrite=True))
     assert {path.name for path in (tmp_path / "orbit").iterdir()} == {"film.mp4", "relit.json"}
 

@@ -1,7 +1,6 @@
 """Tiles of a capture: how it is cut, and how parts become one result again."""
 
 import dataclasses
-import functools
 import itertools
 import json
 import runpy
@@ -143,7 +142,7 @@ def test_what_two_tiles_find_is_mixed_where_they_overlap(whole, plan):
 def test_a_value_that_is_none_has_no_say_outside_of_the_object(whole, plan):
     parts = cut_up(whole, plan)
     for part in parts:
-        part.B_sd[:, ~part.mask] = torch.nan
+        part.B_sd[~part.mask] = torch.nan
     assert join("1234", parts, SIZE, plan).B_sd.isfinite().all()
 
 
@@ -196,9 +195,9 @@ def test_a_share_without_a_pixel_of_the_object_is_refused():
 
 @pytest.mark.slow
 def test_a_capture_in_tiles_is_one_result(captured, tmp_path, monkeypatch, capsys):
-    effort = functools.partial(reflectance.Effort, minima=1, rounds=1, starts=1)
-    monkeypatch.setattr(reflectance, "Effort", effort)
-    settings = FitSettings(tolerance=1e-2, max_iterations=2, globals_pixels=40, lobe="single", scattering_sd=0.0)
+    monkeypatch.setattr(reflectance, "START_N_S", (20.0, 20.0))
+    monkeypatch.setattr(reflectance, "ROUNDS", 1)
+    settings = FitSettings(tolerance=1e-2, max_iterations=2)
     out = tmp_path / "out"
     job = TilesJob(
         fit=FitJob(capture=str(captured), out=str(out), fit=settings), tiling=Tiling(columns=2, rows=1, overlap_px=8)

@@ -97,6 +97,10 @@ def solve_joint(  # noqa: PLR0913  (a problem, where it starts, and when it ends
     iteration = 0
     for iteration in range(1, end.max_iterations + 1):
         voters = now.cost.argsort()[: max(1, int(trim * len(problem)))].sort().values
+        voters = voters[now.cost[voters].isfinite()]
+        if len(voters) == 0:
+            status = Status.FAILED
+            break
         total = lambda s, g, v=voters: float(s.cost[v].sum() + 0.5 * problem.shared_rows(g).square().sum())  # noqa: E731
         before = total(now, shared)
         history.append(before)
@@ -154,5 +158,6 @@ def reduced(
         return S[None], right[None], X.movedim(-1, 0)
 
     S, right, X = by_chunks(len(problem), chunk, part)
-    J = torch.func.jacfwd(problem.shared_rows)(shared)
+    # Forward mode may answer in double precision where single came in.
+    J = torch.func.jacfwd(problem.shared_rows)(shared).to(shared.dtype)
     return S.sum(0) + J.mT @ J, right.sum(0) - J.mT @ problem.shared_rows(shared), X

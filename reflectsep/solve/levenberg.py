@@ -99,6 +99,7 @@ def solve_blocks(problem: Problem, local: Float[Tensor, "P blocks"], shared: Ten
     at = problem.normal(x, shared)
     cost = at.cost.clone()
     status = torch.full(cost.shape, int(Status.EXHAUSTED), dtype=torch.int8, device=x.device)
+    cost[~at.g.isfinite().all(0)] = torch.inf
     status[~cost.isfinite()] = int(Status.FAILED)
     active = cost.isfinite().nonzero()[:, 0]
     if len(active) < len(cost):
@@ -113,7 +114,8 @@ def solve_blocks(problem: Problem, local: Float[Tensor, "P blocks"], shared: Ten
         foretold = -0.5 * (step * (at.g - damping * scale * step)).sum(0)
         new = problem.normal(here + step, shared)
         gain = (at.cost - new.cost) / foretold
-        better = gain > ACCEPTED_GAIN  # false for what is not a number
+        # False for what is not a number; a cost may be finite where its slope is none.
+        better = (gain > ACCEPTED_GAIN) & new.g.isfinite().all(0) & new.V.isfinite().flatten(0, 1).all(0)
         ended = better & (at.cost - new.cost <= end.tolerance * at.cost)
         # At rest: not even the linear model promises a decrease that counts.
         ended |= foretold <= 0.1 * end.tolerance * at.cost

@@ -94,7 +94,7 @@ def decoded_relight(folder: Path):
 def saved(tmp_path_factory, result):
     folder = tmp_path_factory.mktemp("export")
     for name, channels in (("colour", 3), ("grey", 1)):
-        result(size=40, channels=channels, n_d=1.0, crest=0.0).save(folder / name)
+        result(size=40, channels=channels, n_d=1.0).save(folder / name)
     return folder
 
 
@@ -177,7 +177,7 @@ def test_pictures_that_are_a_polynomial_are_fitted_exactly(result):
 
 def test_textures_of_a_lambertian_object_render_as_relit(result):
     """With d = q N.L and no lobe beyond it the textures carry everything."""
-    separation = result(size=32, n_d=1.0, softness=0.0, crest=0.0, channels=3)
+    separation = result(size=32, n_d=1.0, softness=0.0, fresnel=0.0, ggx=False, channels=3)
     import dataclasses
 
     flat = dataclasses.replace(separation, s=torch.zeros_like(separation.s))

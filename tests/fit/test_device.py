@@ -1,7 +1,6 @@
 """Chunks worked on elsewhere: on a device that is pretended here, and on a real one where there is one."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -16,7 +15,7 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.reflectance import fit_reflectance
 from reflectsep.pipeline import fit_options
 
-QUICK = FitOptions(globals_pixels=12, max_iterations=1, chunk=60, tolerance=1e-2)
+QUICK = FitOptions(max_iterations=1, chunk=60, tolerance=1e-2)
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
 
@@ -75,10 +74,12 @@ def test_the_pretended_device_tells_what_is_not_on_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"alpha_sd": 0.02, "lobe": "ggx", "refine_n_d": True}])
+@pytest.mark.xfail(strict=True, reason="the fit does not read its device yet")
+@pytest.mark.parametrize("options", [{}, {"alpha_sd": 0.02, "lobe": "power", "refine_n_d": True}])
 def test_chunks_are_worked_on_wholly_on_the_device(paper_case, monkeypatch, options):
-    # One start and one round each: what is tested is where, not how well.
-    monkeypatch.setattr(reflectance, "Effort", partial(reflectance.Effort, minima=1, rounds=1, starts=1))
+    # One start and one round: what is tested is where, not how well.
+    monkeypatch.setattr(reflectance, "START_N_S", (20.0, 20.0))
+    monkeypatch.setattr(reflectance, "ROUNDS", 1)
     case = paper_case(size=9, channels=3, n_d=1.2)
     quick = replace(QUICK, **options)
     expected = fit_reflectance(case.stack, case.scattering, quick)
@@ -102,8 +103,8 @@ def test_a_device_that_is_not_there_is_said():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 def test_a_fit_on_a_real_device_is_that_of_the_processor(paper_case):
     case = paper_case(size=24, channels=3, sigma=0.002)
-    expected = fit_reflectance(case.stack, case.scattering, FitOptions(globals_pixels=60))
-    fit = fit_reflectance(case.stack, case.scattering, FitOptions(globals_pixels=60, device="cuda"))
+    expected = fit_reflectance(case.stack, case.scattering, FitOptions())
+    fit = fit_reflectance(case.stack, case.scattering, FitOptions(device="cuda"))
     torch.testing.assert_close(fit.a, expected.a, rtol=1e-3, atol=0.0)
     torch.testing.assert_close(fit.n_s, expected.n_s, rtol=1e-3, atol=0.0)
     assert fit.cost == pytest.approx(expected.cost, rel=1e-4)

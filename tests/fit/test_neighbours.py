@@ -1,156 +1,214 @@
+"""What neighbours say of each other: small algebra, pooling, and messages without what came from outside."""
+
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from reflectsep.fit import chunks, neighbours
-from reflectsep.fit.neighbours import QUADRATIC, local_median, local_quadratic, neighbourhood, smooth, to_map
-
-
-def some_mask():
-    mask = torch.ones(9, 11, dtype=torch.bool)
-    mask[:2], mask[4, 5], mask[8, 10] = False, False, False
-    return mask
-
-
-def some_values(mask, channels=2):
-    g = torch.Generator().manual_seed(0)
-    return torch.rand(int(mask.sum()), channels, generator=g, dtype=torch.float64)
-
-
-def test_to_map_puts_values_where_they_belong():
-    mask = some_mask()
-    values = some_values(mask)
-    picture = to_map(values, mask)
-    assert torch.equal(picture[:, mask].T, values)
-    assert float(picture[:, ~mask].abs().max()) == 0.0
+from reflectsep.fit.neighbours import (
+    SPREADS,
+    WIDTHS_PX,
+    Messages,
+    Smoothness,
+    best_smoothness,
+    inverse,
+    likelihood,
+    messages,
+    neighbours,
+    plus_spread,
+    pooled,
+    symmetric_times,
+    upper_root,
+)
+from reflectsep.fit.problem import UPPER, Neighbours, globals_of, log_size
+from reflectsep.model import mixed, reflectance
+from reflectsep.solve.levenberg import Termination, solve_blocks
 
 
-@given(st.floats(-5, 5), st.floats(0.5, 3))
-def test_smoothing_leaves_a_constant_alone_up_to_the_edge_of_the_mask(value, sigma_px):
-    mask = some_mask()
-    values = torch.full((int(mask.sum()), 1), value, dtype=torch.float64)
-    weight = some_values(mask)[:, 0] + 0.1
-    torch.testing.assert_close(smooth(values, weight, mask, sigma_px), values, rtol=1e-6, atol=1e-9)
+def full(S):
+    """(pixels, 3, 3) of an upper triangle (6, pixels)."""
+    whole = S.new_zeros(S.shape[1], 3, 3)
+    for entry, (i, j) in zip(S, UPPER, strict=True):
+        whole[:, i, j] = whole[:, j, i] = entry
+    return whole
 
 
-def test_smoothing_is_the_weighted_gaussian_mean():
-    mask = some_mask()
-    values, weight = some_values(mask, 1), some_values(mask)[:, 1]
-    y, x = (c.double() for c in mask.nonzero(as_tuple=True))
-    apart = (y[:, None] - y).square() + (x[:, None] - x).square()
-    near = ((y[:, None] - y).abs() <= 3) & ((x[:, None] - x).abs() <= 3)
-    kernel = torch.where(near, torch.exp(-apart / 2), 0.0) * weight
-    expected = kernel @ values / kernel.sum(1, keepdim=True)
-    torch.testing.assert_close(smooth(values, weight, mask, 1.0), expected, rtol=1e-6, atol=1e-9)
+def packed(whole):
+    return torch.stack([whole[:, i, j] for i, j in UPPER])
 
 
-def test_what_has_no_weight_has_no_say():
-    mask = some_mask()
-    values = torch.ones(int(mask.sum()), 1, dtype=torch.float64)
-    weight = torch.ones(len(values), dtype=torch.float64)
-    values[30], weight[30] = 1e6, 0.0
-    torch.testing.assert_close(smooth(values, weight, mask, 1.0), torch.ones_like(values))
+def covariances(pixels=30, size=1.0):
+    g = torch.Generator().manual_seed(1)
+    root = torch.randn(pixels, 3, 4, generator=g, dtype=torch.float64)
+    return packed(size * root @ root.mT)
 
 
-def test_the_median_is_of_the_neighbours_inside_the_mask_without_the_pixel_itself():
-    mask = some_mask()
-    values = some_values(mask)
-    places = [tuple(p) for p in mask.nonzero().tolist()]
-    for radius in (1, 2):
-        median = local_median(values, mask, radius)
-        for i, (y, x) in enumerate(places):
-            around = [j for j, (v, u) in enumerate(places) if j != i and abs(v - y) <= radius and abs(u - x) <= radius]
-            assert torch.equal(median[i], values[around].median(0).values)
+def vectors(pixels=30):
+    return torch.rand(3, pixels, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 4])
-def test_medians_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, rows):
-    mask = some_mask()
-    values = some_values(mask)
-    whole = local_median(values, mask, 2)
-    monkeypatch.setattr(neighbours, "PIXELS_OF_WINDOWS", rows * mask.shape[1])
-    assert torch.equal(local_median(values, mask, 2), whole)
+def test_the_algebra_of_upper_triangles_is_that_of_linalg():
+    S, v = covariances(), vectors()
+    torch.testing.assert_close(full(inverse(S)), torch.linalg.inv(full(S)), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(symmetric_times(S, v).mT[..., None], full(S) @ v.mT[..., None])
+    torch.testing.assert_close(full(plus_spread(S, 0.3)), full(S) + 0.09 * torch.eye(3, dtype=torch.float64))
+    R = upper_root(S)
+    upper = full(R).triu()
+    torch.testing.assert_close(upper, torch.linalg.cholesky(full(S)).mT, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(Neighbours(vector=v, R=R).precision().movedim(-1, 0), full(S))
 
 
-@pytest.mark.parametrize("rows", [1, 2, 4])
-def test_means_and_surfaces_by_bands_of_rows_are_those_of_the_whole_picture(monkeypatch, rows):
-    mask = some_mask()
-    mask[3:6] = False  # bands without a pixel, too
-    values, weight = some_values(mask, 3), some_values(mask)[:, 0] + 0.1
-    mean, surface = smooth(values, weight, mask, 1.0), local_quadratic(values, weight, mask, 1.0)
-    monkeypatch.setattr(neighbours, "PIXELS_OF_A_BAND", rows * mask.shape[1])
-    assert torch.equal(smooth(values, weight, mask, 1.0), mean)
-    parts = local_quadratic(values, weight, mask, 1.0)
-    assert torch.equal(parts[0], surface[0])
-    assert torch.equal(parts[1], surface[1])
+def test_roots_and_inverses_of_nothing_are_finite():
+    nothing = torch.zeros(6, 2, dtype=torch.float64)
+    assert upper_root(nothing).isfinite().all()
+    assert inverse(nothing).isfinite().all()
 
 
-def test_of_an_empty_mask_there_is_nothing():
-    nothing = torch.zeros(5, 4, dtype=torch.bool)
-    assert smooth(torch.ones(0, 2), torch.ones(0), nothing, 1.0).shape == (0, 2)
+def disc(size=15):
+    row, column = torch.meshgrid(torch.arange(size), torch.arange(size), indexing="ij")
+    return (row - size // 2) ** 2 + (column - size // 2) ** 2 < (0.48 * size) ** 2
 
 
-def test_quadratics_a_few_pixels_at_a_time_are_those_of_all(monkeypatch):
-    mask = some_mask()
-    values, weight = some_values(mask, 3), some_values(mask)[:, 0] + 0.1
-    whole = local_quadratic(values, weight, mask, 1.0)
-    monkeypatch.setattr(chunks, "AT_ONCE", 7)
-    parts = local_quadratic(values, weight, mask, 1.0)
-    assert torch.equal(parts[0], whole[0])
-    assert torch.equal(parts[1], whole[1])
+SURE, BLANK = (torch.tensor([s, 0, 0, s, 0, s], dtype=torch.float64)[:, None] for s in (1e-6, 1e6))
 
 
-def test_an_outlier_is_replaced_and_a_lone_pixel_keeps_its_value():
-    mask = torch.zeros(7, 7, dtype=torch.bool)
-    mask[:3, :3] = True
-    mask[6, 6] = True
-    values = torch.ones(10, 1, dtype=torch.float64)
-    values[4], values[9] = 100.0, 7.0
-    median = local_median(values, mask, 1)
-    assert torch.equal(median, torch.tensor([1.0] * 9 + [7.0], dtype=torch.float64)[:, None])
+@pytest.mark.parametrize("width_px", WIDTHS_PX)
+def test_a_constant_field_is_its_own_neighbourhood(width_px):
+    mask = disc()
+    pixels = int(mask.sum())
+    value = torch.tensor([0.3, 0.7, 0.5], dtype=torch.float64)[:, None].expand(3, pixels)
+    said = Messages(value, SURE.expand(6, pixels))
+    mean, covariance = pooled(said, mask, width_px, 0.05)
+    torch.testing.assert_close(mean, value, rtol=1e-4, atol=0)
+    # A pixel is within the spread of its neighbours, and the sum of many neighbours is known better than one of them.
+    assert (covariance[[0, 3, 5]] > 0.05**2).all()
+    assert (covariance[[0, 3, 5]] < 2 * 0.05**2).all()
 
 
-def test_the_window_leaves_the_pixel_out():
-    mask = some_mask()
-    window = neighbourhood(some_values(mask), mask, 1)
-    assert window.shape == (int(mask.sum()), 2, 8)
-    assert window[0].isnan().any()  # at the mask's edge
+def test_a_pixel_does_not_hear_itself():
+    mask = disc()
+    pixels = int(mask.sum())
+    value = torch.full((3, pixels), 0.5, dtype=torch.float64)
+    centre = pixels // 2
+    value[:, centre] = 2.0
+    mean, _ = pooled(Messages(value, SURE.expand(6, pixels)), mask, 1.5, 0.05)
+    torch.testing.assert_close(mean[:, centre], torch.full((3,), 0.5, dtype=torch.float64), rtol=1e-4, atol=0)
+    assert (mean[:, centre + 1] > 0.55).all()
 
 
-def test_a_quadratic_surface_is_predicted_from_its_other_pixels():
-    mask = torch.ones(14, 15, dtype=torch.bool)
-    mask[0, :4], mask[7, 7] = False, False
-    y, x = (c.double() / 10 for c in mask.nonzero(as_tuple=True))
-    surface = torch.stack([0.3 - x + 2 * y + x * x - 0.5 * x * y + 0.7 * y * y, 1 + x * y], 1)
-    spoilt = surface.clone()
-    # Its own value has no say: a wrong pixel is predicted as if it were right.
-    spoilt[100] += 5.0
-    weight = torch.ones(len(x), dtype=torch.float64)
-    weight[100] = 0.0
-    predicted, _ = local_quadratic(spoilt, weight, mask, 2.0)
-    # The trace of a ridge costs most in the corners.
-    tolerance = 2e-3 * float(surface.amax() - surface.amin())
-    assert float((predicted - surface).abs().max()) < tolerance
-    alone, _ = local_quadratic(spoilt, torch.ones_like(weight), mask, 2.0)
-    torch.testing.assert_close(alone[100], surface[100], rtol=0, atol=tolerance)
+def test_a_pixel_that_knows_nothing_gets_its_neighbours_mean_and_tells_them_nothing():
+    mask = disc()
+    pixels = int(mask.sum())
+    value = vectors(pixels)
+    covariance = SURE.expand(6, pixels).clone()
+    centre = pixels // 2
+    value[:, centre], covariance[:, centre] = 100.0, BLANK[:, 0]
+    mean, _ = pooled(Messages(value, covariance), mask, 1.0, 0.05)
+    place = torch.full(mask.shape, -1)
+    place[mask] = torch.arange(pixels)
+    row, column = (int(x) for x in (place == centre).nonzero()[0])
+    total, weight = torch.zeros(3, dtype=torch.float64), 0.0
+    for y in range(row - 3, row + 4):
+        for x in range(column - 3, column + 4):
+            if (y, x) != (row, column) and 0 <= y < 15 and 0 <= x < 15 and mask[y, x]:
+                k = float(torch.exp(torch.tensor(-0.5 * ((y - row) ** 2 + (x - column) ** 2), dtype=torch.float64)))
+                total += k * value[:, place[y, x]]
+                weight += k
+    torch.testing.assert_close(mean[:, centre], total / weight, rtol=1e-4, atol=1e-6)
+    assert float(mean.max()) < 1.001
 
 
-def test_the_prediction_is_the_weighted_regression_with_its_variance():
-    mask = some_mask()
-    values, weight = some_values(mask, 1), some_values(mask)[:, 1] + 0.2
-    y, x = (c.double() for c in mask.nonzero(as_tuple=True))
-    predicted, variance = local_quadratic(values, weight, mask, 1.5)
-    for i in (3, 30, 60):
-        dx, dy = (x - x[i]) / 1.5, (y - y[i]) / 1.5
-        near = (dx.abs() * 1.5 <= 4) & (dy.abs() * 1.5 <= 4)
-        near[i] = False
-        w = (weight * torch.exp(-0.5 * (dx**2 + dy**2)))[near]
-        design = torch.stack([dx**a * dy**b for a, b in QUADRATIC], 1)[near]
-        normal = design.T @ (w[:, None] * design)
-        expected = torch.linalg.solve(normal, design.T @ (w * values[near, 0]))[0]
-        # A trace of a ridge is all that sets the two apart.
-        assert float(predicted[i, 0] - expected) == pytest.approx(0.0, abs=0.02)
-        assert float(variance[i]) == pytest.approx(float(torch.linalg.inv(normal)[0, 0]), rel=0.02)
+def test_a_pixel_alone_hears_nothing_that_counts():
+    mask = torch.zeros(5, 5, dtype=torch.bool)
+    mask[2, 2] = True
+    mean, covariance = pooled(Messages(vectors(1), SURE.clone()), mask, 1.0, 0.05)
+    assert mean.isfinite().all()
+    assert (covariance[[0, 3, 5]] > 50).all()
+
+
+def test_what_neighbours_say_is_a_mean_and_a_root_of_its_precision():
+    mask = disc()
+    pixels = int(mask.sum())
+    said = Messages(vectors(pixels), covariances(pixels, 1e-3))
+    near = neighbours(said, mask, Smoothness(1.5, 0.03))
+    mean, covariance = pooled(said, mask, 1.5, 0.03)
+    torch.testing.assert_close(near.vector, mean)
+    torch.testing.assert_close(near.precision().movedim(-1, 0), torch.linalg.inv(full(covariance)))
+
+
+def test_the_likelihood_is_that_of_a_normal_distribution():
+    # Scaled so that no distance is an outlier's.
+    said = Messages(vectors(), plus_spread(covariances(size=0.1), 1.0))
+    mean, covariance = vectors().flip(1), plus_spread(covariances(size=0.2).flip(1), 1.0)
+    normal = torch.distributions.MultivariateNormal(mean.mT, full(covariance) + full(said.covariance))
+    expected = normal.log_prob(said.mean.mT) + 1.5 * torch.log(torch.tensor(2 * torch.pi, dtype=torch.float64))
+    distance = -2 * (expected + 0.5 * torch.logdet(normal.covariance_matrix))
+    assert 0.1 < float(distance.max()) < 25
+    assert likelihood(said, mean, covariance) == pytest.approx(float(expected.mean()), rel=1e-9)
+
+
+@pytest.mark.parametrize("spread", SPREADS)
+def test_the_smoothness_of_a_rough_field_is_found(spread):
+    mask = torch.ones(40, 40, dtype=torch.bool)
+    g = torch.Generator().manual_seed(4)
+    value = 0.5 + spread * torch.randn(3, 1600, generator=g, dtype=torch.float64)
+    found = best_smoothness(Messages(value, SURE.expand(6, 1600)), mask)
+    assert found.spread == spread
+    assert found.width_px == max(WIDTHS_PX)  # noise about a constant: the more neighbours, the better
+
+
+def settled(random_problem, **changes):
+    """A problem whose pictures its model nearly explains, and its optimum under the pictures alone."""
+    problem, local, shared = random_problem(channels=3, pixels=30, sigma=1e-3, huber=None, neighbours=None, **changes)
+    obs = problem.obs
+    s = obs.s[:3]
+    obs = replace(obs, s=mixed(obs.alpha, s), clipped=torch.zeros_like(obs.clipped))
+    d, B = problem.unpacked(local)
+    g = torch.Generator().manual_seed(3)
+    noise = 1e-3 * torch.randn(obs.images.shape, generator=g, dtype=torch.float64)
+    images = reflectance(d, B, globals_of(shared, obs), s=s, alpha=obs.alpha) + noise
+    problem = replace(problem, obs=replace(obs, images=images))
+    found = solve_blocks(problem, local, shared, Termination(tolerance=1e-14, max_iterations=200))
+    return problem, found.local, shared
+
+
+def test_messages_tell_the_vector_and_its_covariance(random_problem):
+    problem, local, shared = settled(random_problem)
+    said = messages(problem, local, shared)
+
+    def vector(local):
+        d, B = problem.unpacked(local)
+        f = globals_of(shared, problem.obs).f
+        return B * (d + (1 - f) * problem.obs.s[:3]).mean(1) / (2 * log_size(shared, problem.obs).exp())
+
+    torch.testing.assert_close(said.mean, vector(local))
+    J = torch.stack(
+        [torch.func.jvp(vector, (local,), (e[:, None].expand_as(local),))[1] for e in torch.eye(10).double()], 1
+    )
+    V = problem.normal(local, shared).V
+    V = torch.tril(V.movedim(-1, 0)) + torch.tril(V.movedim(-1, 0), -1).mT
+    expected = J.movedim(-1, 0) @ torch.linalg.solve(V, J.movedim(-1, 0).mT)
+    sure = torch.linalg.cond(V) < 1e7
+    assert int(sure.sum()) > 10
+    torch.testing.assert_close(full(said.covariance)[sure], expected[sure], rtol=1e-2, atol=1e-12)
+
+
+def test_messages_do_not_hand_back_what_the_neighbours_said(random_problem):
+    problem, local, shared = settled(random_problem)
+    alone = messages(problem, local, shared)
+    known = (alone.covariance[[0, 3, 5]] < 1e-3).all(0)
+    assert int(known.sum()) >= 8
+    # Expected a tenth of a standard deviation off, and as surely: everything near the optimum is linear.
+    sd = alone.covariance[[0, 3, 5]].sqrt()
+    near = Neighbours(vector=alone.mean + 0.1 * sd, R=upper_root(inverse(plus_spread(alone.covariance, 1e-4))))
+    pulled = replace(problem, neighbours=near)
+    there = solve_blocks(pulled, local, shared, Termination(tolerance=1e-14, max_iterations=200)).local
+    said = messages(pulled, there, shared)
+    held = messages(replace(problem, neighbours=None), there, shared)
+    off = lambda m: ((m.mean - alone.mean).abs() / sd)[:, known]  # noqa: E731
+    assert float(off(held).median()) > 0.02  # the pixels did move
+    assert float(off(said).median()) < 0.25 * float(off(held).median())
+    ratio = (said.covariance / alone.covariance)[[0, 3, 5]][:, known]
+    assert float((ratio.log().abs()).median()) < 0.05

@@ -1,3 +1,5 @@
+"""The problem's closed forms beside autograd, and what its rows are."""
+
 from __future__ import annotations
 
 import math
@@ -5,330 +7,242 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from reflectsep.fit import chunks
-from reflectsep.fit.blocks import build_problem
-from reflectsep.fit.expectations import (
-    first_priors,
-    noise_level,
-    parallel_spread,
-    parallel_weight,
-    quantile,
-    shape_spread,
-    with_facing,
-    with_ratio,
-)
-from reflectsep.fit.options import FitOptions
+from reflectsep.fit.autograd import DifferentiatedProblem, UnknownScattering
 from reflectsep.fit.problem import (
-    LOG_C_2,
+    ALPHA,
+    FRESNEL,
+    LOG_N_D,
     LOG_N_S,
-    SOFTNESS,
-    Locals,
-    log_shape,
-    no_priors,
-    normalised_lobe,
-    pixel_residual,
-    shared_residual,
-    unpack,
+    SHARED_NAMES,
+    F,
+    globals_of,
+    log_size,
+    refined,
+    upper_times,
 )
-from reflectsep.fit.reflectance import observe, prepare, weights
-from reflectsep.fit.solution import Effort, LocalFit, fit_locals, hand_on_lobes, initial_shared, lobe_pictures, merge
-from reflectsep.solve.problem import forward_jacobian
+from reflectsep.model import length, lobe_of, lobe_vector, mixed, reflectance
+from reflectsep.solve.levenberg import Status, Termination, solve_blocks
+
+CASES = [
+    pytest.param({}, id="grey"),
+    pytest.param({"channels": 3}, id="colour"),
+    pytest.param({"n_d": None}, id="grey, n_d fitted"),
+    pytest.param({"channels": 3, "n_d": None}, id="colour, n_d fitted"),
+    pytest.param({"channels": 3, "n_d": 1.3, "refined": True}, id="alphas refined"),
+    pytest.param({"channels": 3, "n_d": None, "refined": True}, id="alphas refined, n_d fitted"),
+    pytest.param({"channels": 3, "ggx": False}, id="power"),
+    pytest.param({"known": False}, id="directions unknown"),
+    pytest.param({"known": False, "refined": True}, id="directions unknown, alphas refined"),
+    pytest.param({"channels": 3, "neighbours": None, "height_spread": math.inf}, id="pictures alone"),
+    pytest.param({"neighbours": None}, id="no neighbours"),
+    pytest.param({"height_spread": math.inf}, id="no height"),
+    pytest.param({"huber": None}, id="plain squares"),
+]
 
 
-def double(x):
-    return torch.tensor(x, dtype=torch.float64)
+def close(found, expected, scale=None):
+    """Equal to 1e-9 of the largest of what is expected."""
+    size = float(expected.abs().max()) if scale is None else scale
+    assert float((found - expected).abs().max()) <= 1e-9 * size
 
 
-def at_truth(case, *, scattering_sd=0.0):
-    """Observations, and the true parameters as the solver's rows."""
-    options = FitOptions(scattering_sd=scattering_sd)
-    obs, mask, _ = observe(case.stack, case.scattering, options, torch.float64)
-    d = case.truth.d[..., mask].permute(2, 1, 0)
-    log_B = case.truth.B[0][mask].log()
-    local = Locals(d, log_B, obs.s_basis if obs.s_unknown else None).pack()
-    shared = initial_shared(obs.images, obs.cosine, 1.0, case.truth.n_s)
-    shared[:3] = case.truth.a
-    shared[LOG_C_2] = torch.log(double(2 * 0.91 * 1.015))
-    return obs, mask, local, shared
+def lower(V):
+    """The triangle that counts."""
+    return torch.tril(V.movedim(-1, 0))
 
 
-def test_the_truth_leaves_no_residual(small_case):
-    obs, _, local, shared = at_truth(small_case)
-    rows = pixel_residual(local, shared, obs, no_priors(len(obs), obs.images))
-    assert float(rows.abs().max()) < 1e-6
-    priors = replace(no_priors(len(obs), obs.images), shape=10.0)
-    # B of the paper's surface is C_2 N.V / q exactly, so the shape row vanishes too.
-    assert float(pixel_residual(local, shared, obs, priors).abs().max()) < 1e-3
+@pytest.mark.parametrize("case", CASES)
+def test_closed_forms_are_those_of_autograd(random_problem, case):
+    problem, local, shared = random_problem(**case)
+    reference, _, _ = random_problem(DifferentiatedProblem, **case)
+    rows = problem.residuals(local, shared)
+    torch.testing.assert_close(problem.normal(local, shared).cost, problem.robust(rows)[0], rtol=1e-9, atol=0)
+    J = reference.jacobian(local, shared)
+    close(problem.jacobian(local, shared), J)
+    by_globals = reference.shared_jacobian(local, shared)
+    found = problem.shared_jacobian(local, shared)
+    for column, name in enumerate([*SHARED_NAMES, *["alpha"] * (len(shared) - ALPHA)]):
+        close(found[:, column], by_globals[:, column], max(float(by_globals[:, column].abs().max()), 1e-6))
+        if name != "log_n_d" or case.get("n_d", 1.0) is None:
+            assert float(by_globals[:, column].abs().max()) > 1e-3 or case.get("known") is False, name
+    at, expected = problem.normal(local, shared), reference.normal(local, shared)
+    close(at.cost, expected.cost)
+    close(at.g, expected.g)
+    close(lower(at.V), lower(expected.V))
+    V, gl, W, H, gg = problem.coupled(local, shared)
+    weight = problem.robust(rows)[1]
+    close(lower(V), lower(expected.V))
+    close(gl, expected.g)
+    close(W, torch.einsum("rpn,rn,rgn->pgn", J, weight, by_globals))
+    close(H, torch.einsum("rhn,rn,rgn->hgn", by_globals, weight, by_globals))
+    close(gg, torch.einsum("rgn,rn->gn", by_globals, weight * rows))
 
 
-def test_locals_pack_and_unpack():
-    g = torch.Generator().manual_seed(0)
-    for s in (None, torch.rand(4, 3, 3, generator=g)):
-        x = Locals(torch.rand(4, 3, 3, generator=g), torch.rand(4, generator=g), s)
-        back = unpack(x.pack(), 3)
-        assert torch.equal(back.d, x.d)
-        assert torch.equal(back.log_B, x.log_B)
-        assert (back.s is None) if s is None else torch.equal(back.s, s)
+def test_the_reference_itself_agrees_with_finite_differences(random_problem):
+    problem, local, shared = random_problem(DifferentiatedProblem, channels=3, n_d=None, refined=True, pixels=2)
+    inputs = (local.clone().requires_grad_(), shared.clone().requires_grad_())
+    assert torch.autograd.gradcheck(problem.residuals, inputs)
 
 
-def test_every_pixels_jacobian_is_its_own(small_case):
-    obs, mask, _ = observe(small_case.stack, small_case.scattering, FitOptions(), torch.float64)
-    state = prepare(obs, mask, FitOptions())
-    problem = build_problem(state.obs, state.priors, robust=5.0).take(torch.arange(0, 576, 97))
-    obs, _, local, shared = at_truth(small_case, scattering_sd=0.03)
-    local, shared = local[::97] + 0.01, shared + 0.01
-    _, J, K = forward_jacobian(problem.residual, local, shared, problem.data)
-    for p in range(2):
-        one = problem.take(slice(p, p + 1))
-        by_local, by_shared = torch.autograd.functional.jacobian(
-            lambda x, g, one=one: one.residuals(x[None], g)[0], (local[p], shared)
-        )
-        torch.testing.assert_close(J[p], by_local, rtol=1e-8, atol=1e-8)
-        torch.testing.assert_close(K[p], by_shared, rtol=1e-8, atol=1e-8)
+def test_rows_are_the_pictures_the_height_and_the_neighbours(random_problem):
+    problem, local, shared = random_problem(channels=3, clipped=0.5)
+    obs, g = problem.obs, globals_of(shared, problem.obs)
+    d, B = problem.unpacked(local)
+    rows = problem.residuals(local, shared)
+    assert len(rows) == 18 + 1 + 3
+    model = reflectance(d, B, g, s=obs.s[:3], alpha=obs.alpha, s_lights=obs.s)
+    off = (model - obs.images) * obs.share / 0.1
+    brighter = obs.clipped & (off > 0)
+    assert brighter.any()
+    assert (obs.clipped & ~brighter).any()
+    pictures = rows[:18].view(6, 3, -1)
+    assert float(pictures[brighter].abs().max()) == 0.0
+    torch.testing.assert_close(pictures[~brighter], off[~brighter])
+    w = lobe_vector(d, obs.s[:3], B, g)
+    log_C = (shared[:3] - obs.cosine.log()).mean()
+    torch.testing.assert_close(rows[18], g.n_s * (length(g.M, w).log() - log_C) / 0.5)
+    v = (w - g.a[:, None]) / (2 * log_C.exp())
+    assert problem.neighbours is not None
+    R = torch.zeros(3, 3, len(obs), dtype=torch.float64)
+    for entry, place in zip(problem.neighbours.R, [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)], strict=True):
+        R[place] = entry
+    torch.testing.assert_close(rows[19:], torch.einsum("ijn,jn->in", R, v - problem.neighbours.vector))
+    torch.testing.assert_close(problem.neighbours.precision(), torch.einsum("kin,kjn->ijn", R, R))
+    torch.testing.assert_close(upper_times(problem.neighbours.R, v), torch.einsum("ijn,jn->in", R, v))
 
 
-def test_a_clipped_value_is_a_lower_bound(small_case):
-    obs, _, local, shared = at_truth(small_case)
-    priors = no_priors(len(obs), obs.images)
-    clipped = replace(obs, clipped=torch.ones_like(obs.clipped))
-    brighter = replace(clipped, images=obs.images - 0.1)
-    darker = replace(clipped, images=obs.images + 0.1)
-    count = obs.images[0].numel()
-    assert float(pixel_residual(local, shared, brighter, priors)[:, :count].abs().max()) == 0.0
-    torch.testing.assert_close(
-        pixel_residual(local, shared, darker, priors)[:, :count], torch.full((len(obs), count), -0.1).double()
+def test_huber_takes_large_residuals_of_pictures_by_their_size_and_others_by_their_square(random_problem):
+    problem, local, shared = random_problem(huber=2.0, sigma=0.05)
+    rows = problem.residuals(local, shared)
+    rows[6:] *= 10.0
+    cost, weight = problem.robust(rows)
+    large = rows[:6].abs() > 2.0
+    assert large.any()
+    assert (~large).any()
+    loss = torch.where(large, 2.0 * rows[:6].abs() - 2.0, 0.5 * rows[:6].square())
+    torch.testing.assert_close(cost, loss.sum(0) + 0.5 * rows[6:].square().sum(0))
+    # The weight is the loss's slope over the residual.
+    torch.testing.assert_close(weight[:6] * rows[:6], rows[:6].clamp(-2.0, 2.0))
+    assert (weight[6:] == 1).all()
+
+
+def test_a_mirror_surface_has_the_height_that_is_expected(random_problem):
+    problem, _, shared = random_problem()
+    obs = problem.obs
+    shared[:3] = obs.cosine.log() + math.log(0.9)
+    N = torch.nn.functional.normalize(torch.randn(3, 7, generator=torch.Generator().manual_seed(3)).double(), dim=0)
+    N[2] = N[2].abs()
+    d = 0.5 * torch.linalg.inv(obs.M) @ N
+    problem = replace(problem, obs=replace(obs, s=torch.zeros_like(obs.s)))
+    local = problem.packed(d[:, None], (2 * 0.9 * N[2] / 0.5).log())
+    assert float(log_size(shared, obs)) == pytest.approx(math.log(0.9))
+    torch.testing.assert_close(problem.residuals(local, shared)[6], torch.zeros(7, dtype=torch.float64))
+
+
+def explained(problem, local, shared):
+    """The problem with pictures that its model explains but for some noise, and a start beside the unknowns."""
+    g = torch.Generator().manual_seed(5)
+    noise = lambda size, like: size * torch.randn(like.shape, generator=g, dtype=like.dtype)  # noqa: E731
+    images, s = problem.obs.images, problem.obs.s[:3]
+    d, B = problem.unpacked(local)
+    obs = replace(problem.obs, s=mixed(problem.obs.alpha, s), clipped=torch.zeros_like(problem.obs.clipped))
+    model = reflectance(d, B, globals_of(shared, obs), s=s, alpha=obs.alpha)
+    obs = replace(obs, images=model + noise(0.02, images))
+    return replace(problem, obs=obs, sigma=0.02), local + noise(0.05, local)
+
+
+def test_a_pixel_does_not_depend_on_what_is_solved_beside_it(random_problem):
+    problem, local, shared = random_problem(channels=3, pixels=40)
+    problem, local = explained(problem, local, shared)
+    end = Termination(tolerance=1e-6, max_iterations=60)
+    together = solve_blocks(problem, local, shared, end)
+    assert (together.status == int(Status.CONVERGED)).sum() > 30
+    some = torch.tensor([3, 4, 11, 39])
+    for index in (some, slice(17, 18)):
+        apart = solve_blocks(problem.take(index), local[:, index], shared, end)
+        torch.testing.assert_close(apart.local, together.local[:, index], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(apart.cost, together.cost[index], rtol=1e-9, atol=0)
+        assert torch.equal(apart.status, together.status[index])
+
+
+def test_a_solved_pixel_has_no_slope_left(random_problem):
+    problem, local, shared = random_problem(channels=3, pixels=40, huber=None)
+    problem, local = explained(problem, local, shared)
+    found = solve_blocks(problem, local, shared, Termination(tolerance=1e-12, max_iterations=200))
+    done = found.status == int(Status.CONVERGED)
+    assert float(done.double().mean()) > 0.8
+    before, after = problem.normal(local, shared), problem.normal(found.local, shared)
+    assert (after.cost <= before.cost).all()
+    slope = (after.g.norm(dim=0) / before.g.norm(dim=0))[done]
+    assert float(slope.median()) < 1e-4
+
+
+def test_refined_alphas_split_into_direction_and_intensity(random_problem):
+    problem, _, shared = random_problem(refined=True)
+    found = refined(problem.obs, shared)
+    beta = problem.obs.alpha[3:] + shared[ALPHA:].view(3, 3)
+    vector = beta @ torch.linalg.inv(problem.obs.M)
+    torch.testing.assert_close(found.intensity[3:], vector.norm(dim=1))
+    torch.testing.assert_close(found.obs.alpha[3:] * found.intensity[3:, None], beta)
+    assert torch.equal(found.obs.alpha[:3], problem.obs.alpha[:3])
+    assert torch.equal(found.intensity[:3], torch.ones(3, dtype=torch.float64))
+    # Light 4 has a sweep of its own; what is mixed moves with the alphas.
+    assert torch.equal(found.obs.s[:4], problem.obs.s[:4])
+    moved = torch.einsum("ji,icn->jcn", found.obs.alpha[4:] - problem.obs.alpha[4:], problem.obs.s[:3])
+    torch.testing.assert_close(found.obs.s[4:], problem.obs.s[4:] + moved)
+
+
+def test_what_is_expected_of_the_globals(random_problem):
+    problem, _, shared = random_problem(n_d=None, refined=True)
+    problem = replace(problem, obs=replace(problem.obs, n_d_sd=0.02), alpha_sd=0.05)
+    shared[:3] = problem.obs.cosine.log() - 0.3
+    rows = problem.shared_rows(shared)
+    # One C_1 for all basis lights, whatever it is, is as expected.
+    torch.testing.assert_close(rows[:3], torch.zeros(3, dtype=torch.float64))
+    assert float(rows[3]) == pytest.approx((0.1 - math.log(1.1)) / 0.02)
+    torch.testing.assert_close(rows[-9:], shared[ALPHA:] / 0.05)
+    assert len(replace(problem, priors=False).shared_rows(shared)) == 3 + 1 + 9
+    shared[0] += 0.01
+    assert float(problem.shared_rows(shared)[:3].square().sum()) == pytest.approx(2 / 3)
+
+
+def test_globals_stay_what_they_can_be(random_problem):
+    problem, _, shared = random_problem()
+    wild = shared.clone()
+    wild[F], wild[FRESNEL], wild[LOG_N_S] = -0.2, 1.4, 30.0
+    found = problem.bounded(wild)
+    assert (float(found[F]), float(found[FRESNEL])) == (0.0, 1.0)
+    assert float(found[LOG_N_S].exp()) == pytest.approx(5000)
+    assert torch.equal(problem.bounded(shared), shared)
+    assert float(globals_of(shared, replace(problem.obs, fixed_n_d=None)).n_d) == pytest.approx(
+        math.exp(float(shared[LOG_N_D]))
     )
 
 
-def test_only_pictures_are_robust(small_case):
-    obs, _, local, shared = at_truth(small_case, scattering_sd=0.03)
-    priors = no_priors(len(obs), obs.images)
-    problem = build_problem(obs, priors, robust=5.0)
-    assert problem.threshold is not None
-    assert problem.residuals(local, shared).shape[1] == len(problem.threshold)
-    assert (problem.threshold[:6] == 5.0).all()
-    assert problem.threshold[6:].isinf().all()
-    assert build_problem(obs, priors, robust=None).threshold is None
+def test_unknown_scattering_is_that_of_the_unknowns(random_problem):
+    problem, local, shared = random_problem(UnknownScattering, channels=3, neighbours=None)
+    d, B = problem.unpacked(local)
+    s = problem.scattering(local)
+    assert len(local) == 2 * 9 + 1
+    g = globals_of(shared, problem.obs)
+    rows = problem.residuals(local, shared)[:18].view(6, 3, -1)
+    alpha = problem.obs.alpha
+    model = reflectance(d, B, g, s=s, alpha=alpha)
+    off = (model - problem.obs.images) * problem.weight
+    free = ~problem.obs.clipped
+    torch.testing.assert_close(rows[free], off[free])
+    assert float(lobe_of(lobe_vector(d, s, B, g), g, alpha).max()) > 1e-3
 
 
-def test_lambda_of_equation_22_weighs_squared_residuals(small_case):
-    obs, *_ = at_truth(small_case)
-    given = weights(obs, FitOptions(lambda_basis=1.0, lambda_other=2.0), 0.01)
-    torch.testing.assert_close(given[0, 0].square() * 1e-4, double([1.0, 1, 1, 2, 2, 2]))
-    assert (weights(obs, FitOptions(weights="noise"), 0.01) == 100.0).all()
-
-
-def test_log_shape_is_the_geometry_of_the_lobe():
-    basis = double([[0.4, 0.1, 0.9], [-0.3, 0.4, 0.87], [-0.1, -0.5, 0.86]])
-    basis = basis / basis.norm(dim=1, keepdim=True)
-    normal, view, q = double([0.1, -0.2, 0.97]), double([0.0, 0.0, 1.0]), 0.6
-    normal = normal / normal.norm()
-    value = log_shape(q * basis @ normal, torch.linalg.inv(basis), view, True)
-    torch.testing.assert_close(value, torch.log(q / (normal @ view)), rtol=1e-4, atol=1e-5)
-    away = log_shape(-q * basis @ normal, torch.linalg.inv(basis), view, True)
-    assert away.isfinite()
-    torch.testing.assert_close(log_shape(double([0.3, 0.6, 0.9]), basis, view, False), double(0.6).log())
-
-
-def test_a_mirror_lobe_within_its_height_meets_the_shared_priors():
-    cosine = double([0.9, 0.88, 0.86])
-    priors = replace(no_priors(1, double([0.0])), height=1.0)
-    shared = torch.zeros(8, dtype=torch.float64)
-    shared[:3], shared[LOG_N_S], shared[LOG_C_2] = -0.9 * cosine, double(14.0).log(), double(1.8).log()
-    assert float(shared_residual(shared, cosine, priors).abs().max()) < 1e-9
-    for index, shift in ((0, -0.05), (LOG_C_2, 0.1), (SOFTNESS, 0.1)):
-        moved = shared.clone()
-        moved[index] += shift
-        assert float(shared_residual(moved, cosine, priors).abs().max()) > 0.1
-    moved = shared.clone()
-    moved[:3] *= 1.2  # a peak of 1.08 ** 14 = 2.9
-    assert float(shared_residual(moved, cosine, priors)[4]) == pytest.approx(14 * float(double(1.08).log()) / 0.03)
-
-
-def test_the_noise_level_is_that_of_the_residuals():
-    g = torch.Generator().manual_seed(0)
-    images = torch.ones(5000, 1, 12, dtype=torch.float64)
-    residual = 0.02 * torch.randn(5000, 1, 12, generator=g, dtype=torch.float64)
-    residual[::20] = 5.0  # highlights have no say
-    assert noise_level(images, residual, 0) == pytest.approx(0.02, rel=0.05)
-    # A fit of 3 of 12 leaves 9 degrees of freedom.
-    assert noise_level(images, residual * 0.75**0.5, 3) == pytest.approx(0.02, rel=0.05)
-    assert noise_level(images, 0 * residual, 3) == pytest.approx(3e-4)
-
-
-def test_the_first_priors_know_the_highest_highlight(small_case):
-    obs, _, _, shared = at_truth(small_case)
-    body = small_case.truth.d[..., small_case.stack.mask].permute(2, 1, 0) + obs.s_basis
-    shine = small_case.specular[:, 0][:, small_case.stack.mask]
-    priors = first_priors(obs, body, 1e-3, shared)
-    assert priors.height == pytest.approx(2 * float(shine.max()), rel=0.05)
-    assert first_priors(replace(obs, lights_known=False), body, 1e-3, shared).shape == pytest.approx(priors.shape / 2)
-
-
-def test_parallel_is_believed_as_far_as_it_holds(small_case):
-    obs, *_ = at_truth(small_case)
-    assert parallel_spread(obs, 3 * obs.s_basis) < 1e-9
-    crossed = obs.s_basis * double([1.5, 1.0, 0.7])
-    assert parallel_spread(obs, crossed) > 0.06
-    weight = [parallel_weight(obs, spread, 1e-3) for spread in (0.02, 0.05, 0.2)]
-    assert (weight[0] > weight[1]).all()
-    assert (weight[1] > weight[2]).all()
-    # In units of the scattering: half as much of it, twice the weight, noise aside.
-    fainter = parallel_weight(replace(obs, s=obs.s / 2), 0.02, 0.0)
-    torch.testing.assert_close(fainter, 2 * parallel_weight(obs, 0.02, 0.0))
-
-
-def test_the_ratio_row_holds_the_neighbourhoods_ratio(small_case):
-    obs, mask, *_ = at_truth(small_case)
-    none = no_priors(len(obs), obs.images)
-    priors = with_ratio(none, obs, 2.5 * obs.s_basis, 2.0 * obs.s_basis, mask)
-    torch.testing.assert_close(priors.ratio, torch.full((len(obs),), 2.5, dtype=torch.float64), rtol=1e-5, atol=1e-5)
-    assert float(priors.ratio_weight.max()) == pytest.approx(100.0)
-    dark = replace(obs, s=torch.zeros_like(obs.s))
-    assert torch.equal(with_ratio(none, dark, obs.s_basis, obs.s_basis, mask).ratio_weight, none.ratio_weight)
-
-
-def test_a_label_has_no_say_in_the_bodys_ratio_nor_the_body_in_its(small_case):
-    obs, mask, *_ = at_truth(small_case)
-    none = no_priors(len(obs), obs.images)
-    rows, columns = mask.nonzero().T
-    label = ((rows >= 10) & (rows < 13) & (columns >= 8) & (columns < 16))[:, None, None]
-    body = torch.where(label, 6.0, 2.0) * obs.s_basis
-    priors = with_ratio(none, obs, torch.where(label, 6.5, 2.5) * obs.s_basis, body, mask)
-    label = label[:, 0, 0]
-    assert (priors.ratio_weight[label] == 0).all()
-    outside = priors.ratio_weight > 0
-    assert int(outside.sum()) > 0.6 * int((~label).sum())
-    assert float((priors.ratio[outside] - 2.5).abs().max()) < 0.05
-    # A patch that only the present fit sets apart, as one in a wrong minimum, is still held to its neighbours.
-    wrong = with_ratio(none, obs, torch.where(label[:, None, None], 6.5, 2.5) * obs.s_basis, 2.0 * obs.s_basis, mask)
-    assert (wrong.ratio_weight[label] > 0).any()
-
-
-def tilted(x, angle):
-    """d of every pixel turned by `angle` within the space of the three lights, of the length it had."""
-    across_it = torch.nn.functional.normalize(torch.linalg.cross(x.d, torch.ones_like(x.d)), dim=-1)
-    return replace(x, d=x.d * math.cos(angle) + across_it * x.d.norm(dim=-1, keepdim=True) * math.sin(angle))
-
-
-def test_a_lobe_is_held_to_the_direction_of_the_whole_light_as_firmly_as_the_seen_ones(small_case):
-    obs, mask, local, shared = at_truth(small_case)
-    none = no_priors(len(obs), obs.images)
-    x, shine = unpack(local, 1), lobe_pictures(obs, local, shared)
-    free = replace(obs, s=torch.zeros_like(obs.s))
-    exact = with_facing(none, free, x, shared, shine, 1e-6, mask)
-    flat = exact.facing_weight > 0
-    torch.testing.assert_close(exact.facing, torch.nn.functional.normalize(x.d[:, 0], dim=-1))
-    # The same light with its scattering turned away from d: nothing else but the learnt scatter differs.
-    turned = tilted(x, 0.08)
-    scattering = torch.cat([x.d - turned.d, obs.s[..., 3:]], -1)
-    loose = with_facing(none, replace(obs, s=scattering), turned, shared, shine, 1e-6, mask)
-    ratio = exact.facing_weight[flat] / loose.facing_weight[flat]
-    assert float(ratio.amax()) < 0.08 / 1.18 / 0.03 * 1.01
-    assert float(ratio.median()) > 1.1
-    unseen = with_facing(none, free, x, shared, 0 * shine, 1e-6, mask)
-    assert bool((unseen.facing_weight[flat] < loose.facing_weight[flat]).all())
-    noisy = with_facing(none, free, x, shared, shine, 0.2 * float(x.d.mean()), mask)
-    assert bool((noisy.facing_weight <= exact.facing_weight).all())
-    dark = with_facing(none, free, replace(x, d=-x.d), shared, shine, 1e-6, mask)
-    assert float(dark.facing_weight.abs().max()) == 0.0
-    # Along the direction the row is nothing, across it the weight times what is across.
-    rows = lambda at: pixel_residual(at.pack(), shared, free, exact)[:, -3:]  # noqa: E731
-    assert float(rows(x).abs().max()) < 1e-9
-    v = normalised_lobe(x, shared)
-    expected = exact.facing_weight * v.norm(dim=-1) * math.sin(0.08)
-    torch.testing.assert_close(rows(tilted(x, 0.08)).norm(dim=-1)[flat], expected[flat])
-
-
-def test_the_shapes_spread_is_measured_on_seen_lobes(small_case):
-    obs, _, local, shared = at_truth(small_case)
-    g = torch.Generator().manual_seed(0)
-    scattered = local.clone()
-    scattered[:, 3] += 0.06 * torch.randn(len(local), generator=g, dtype=torch.float64)
-    shine = lobe_pictures(obs, local, shared)
-    assert shape_spread(obs, scattered, shared, shine, 1e-3) == pytest.approx(0.06, rel=0.15)
-    assert shape_spread(obs, local, shared, shine, 1e-3) == pytest.approx(0.02)
-    assert shape_spread(obs, scattered, shared, 0 * shine, 1e-3) == pytest.approx(0.1)
-
-
-def test_lobe_pictures_are_the_specular_component(small_case):
-    obs, mask, local, shared = at_truth(small_case)
-    expected = small_case.specular[:, 0][:, mask].T
-    torch.testing.assert_close(lobe_pictures(obs, local, shared), expected, rtol=1e-4, atol=1e-6)
-
-
-EFFORT = Effort(minima=2)
-
-
-def noisy_fit(case, robust=5.0):
-    obs, mask, local, shared = at_truth(case)
-    obs = replace(obs, weight=weights(obs, FitOptions(), 1e-3))
-    priors = replace(no_priors(len(obs), obs.images), shape=10.0)
-    return obs, priors, mask, local, shared, fit_locals(obs, priors, shared, EFFORT, robust)
-
-
-def test_given_the_globals_the_pixels_that_see_the_lobe_are_recovered(small_case):
-    _, _, mask, local, _, found = noisy_fit(small_case)
-    sees = small_case.sees_lobe(0.003)[mask]
-    right = ((found.local - local).abs() < 0.01 * local.abs().amax(1, keepdim=True)).all(1)
-    assert float(right[sees].double().mean()) > 0.98
-    assert float(found.converged.double().mean()) > 0.99
-    assert (found.runner_up >= found.cost).all()
-
-
-def test_handing_lobes_on_never_raises_a_cost_and_mends_wrong_pixels(small_case):
-    obs, priors, mask, local, shared, found = noisy_fit(small_case)
-    broken = found.local.clone()
-    broken[::7, :3] *= 0.3
-    problem = build_problem(obs, priors, robust=5.0)
-    cost = problem.costs(broken, shared)
-    state = LocalFit(broken, cost, torch.full_like(cost, torch.inf), torch.zeros_like(found.converged))
-    mended = hand_on_lobes(obs, priors, state, shared, mask, EFFORT, 5.0, radius=1)
-    assert (mended.cost <= cost).all()
-    torch.testing.assert_close(mended.cost, problem.costs(mended.local, shared))
-    right = ((mended.local - local).abs() < 0.01 * local.abs().amax(1, keepdim=True)).all(1)
-    assert float(right[::7].double().mean()) > 0.9
-
-
-def test_merging_a_few_pixels_at_a_time_is_merging_all(monkeypatch):
-    g = torch.Generator().manual_seed(3)
-    rand = lambda *n: torch.rand(*n, generator=g, dtype=torch.float64)  # noqa: E731
-    first = merge(None, torch.arange(50), rand(50, 3), rand(50), rand(50) > 0.5, 50)
-    which = torch.randperm(50, generator=g)[:37]
-    more = which, rand(37, 3), rand(37), rand(37) > 0.5, 50
-    before = first.local.clone()
-    whole = merge(first, *more)
-    assert torch.equal(first.local, before)
-    monkeypatch.setattr(chunks, "AT_ONCE", 5)
-    parts = merge(first, *more)
-    for name in ("local", "cost", "runner_up", "converged"):
-        assert torch.equal(getattr(parts, name), getattr(whole, name)), name
-
-
-@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.floats(0, 1))
-def test_a_quantile_is_torchs_own_bit_for_bit(values, share):
-    values = torch.tensor(values, dtype=torch.float64)
-    assert quantile(values, share) == float(values.quantile(share))
-
-
-def test_a_quantile_among_the_finite_ones_takes_no_notice_of_the_infinite():
-    assert quantile(double([torch.inf, 1.0, 3.0, 2.0, torch.inf]), 0.5) == 3.0
-    assert quantile(double([torch.inf, 1.0]), 1.0) == torch.inf
-
-
-def test_merging_keeps_the_better_and_remembers_the_other():
-    row = lambda *x: double([[v, v] for v in x])  # noqa: E731
-    yes = torch.ones(3, dtype=torch.bool)
-    first = merge(None, torch.arange(3), row(1.0, 2.0, 3.0), double([5.0, 5.0, 5.0]), yes, 3)
-    second = merge(first, torch.tensor([0, 2]), row(9.0, 8.0), double([7.0, 1.0]), ~yes[:2], 3)
-    assert torch.equal(second.local, row(1.0, 2.0, 8.0))
-    assert torch.equal(second.cost, double([5.0, 5.0, 1.0]))
-    assert torch.equal(second.runner_up, double([7.0, torch.inf, 5.0]))
-    assert second.converged.tolist() == [True, True, False]
-    # A solution that is the same one again is no rival, and one that is no number loses.
-    again = merge(first, torch.tensor([0, 1]), row(1.001, 7.0), double([5.1, torch.nan]), yes[:2], 3)
-    assert torch.equal(again.runner_up, double([torch.inf] * 3))
-    assert torch.equal(again.cost, first.cost)
+def test_locals_are_packed_and_unpacked(random_problem):
+    problem, local, _ = random_problem(channels=3)
+    d, B = problem.unpacked(local)
+    assert d.shape == (3, 3, 7)
+    assert torch.equal(local[4], d[1, 1])  # basis light by basis light, channel by channel
+    torch.testing.assert_close(problem.packed(d, B.log()), local)
+    cut = problem.take(slice(2, 5))
+    assert len(cut) == 3
+    assert torch.equal(cut.obs.images, problem.obs.images[..., 2:5])
+    assert cut.neighbours is not None
+    assert torch.equal(cut.neighbours.R, problem.neighbours.R[:, 2:5])

@@ -162,14 +162,14 @@ def test_the_command_names_what_is_not_the_default(exact):
         "capture": "/data/my wax",
         "heldout": ["L7"],
         "settings": {
-            "fit": {"lobe": "ggx", "chunk": FitSettings().chunk, "n_s": None},
+            "fit": {"lobe": "power", "chunk": FitSettings().chunk, "n_s": None},
             "scatter": {"distance_px": 2.0},
         },
     }
     said = command(dataclasses.replace(separation, document=document), "out")
     assert said == (
         "reflectsep fit 'capture=/data/my wax' out=out 'basis=[L1,L2,L3]' 'heldout=[L7]' "
-        "fit.lobe=ggx scatter.distance_px=2.0"
+        "fit.lobe=power scatter.distance_px=2.0"
     )
 
 
@@ -187,27 +187,25 @@ def test_frames_to_show_are_those_that_were_asked_for(flat):
         view_sweep(flat, Slab(), n_d=1.0, lit_frames=2.0, frames=[2, 16])
 
 
-@pytest.mark.parametrize(
-    ("softness", "crest", "said"),
-    [
-        (0.0, 0.0, ""),
-        (0.2, 0.0, "soft shadow edges lowered the cost and were kept"),
-        (0.0, 0.1, "the lobe is that of GGX microfacets, as asked for"),
-        (
-            0.2,
-            0.1,
-            "soft shadow edges lowered the cost and were kept; the lobe is that of GGX microfacets, as asked for",
-        ),
-    ],
-)
-def test_only_extensions_that_are_there_are_named(exact, tmp_path, softness, crest, said):
+NAMED = {
+    "softness": (0.2, "shadow edges soft by 0.20 of the cosine"),
+    "fresnel": (0.45, "45 % of Fresnel's losses in the body"),
+    "f": (0.4, "the lobe turns with d + 0.60 s"),
+    "ggx": (True, "GGX lobe of roughness 0.26"),
+}
+
+
+@pytest.mark.parametrize("there", [(), ("softness",), ("fresnel",), ("f",), ("ggx",), tuple(NAMED)])
+def test_only_extensions_that_are_there_are_named(exact, tmp_path, there):
     separation, _ = exact
-    made = dataclasses.replace(separation, softness=torch.tensor(softness), crest=torch.tensor(crest))
+    changes = {name: NAMED[name][0] for name in there}
+    changes |= {name: torch.tensor(value) for name, value in changes.items() if name != "ggx"}
+    made = dataclasses.replace(separation, **changes)
+    assert float(made.n_s) == 14.0
     write_report(tmp_path / "r.html", Facts(name="x", separation=made, command=""))
-    text = (tmp_path / "r.html").read_text()
-    assert ("lowered the cost" in text) == (softness > 0)
-    assert ("as asked for" in text) == (crest > 0)
-    assert said in text
+    text = html.unescape((tmp_path / "r.html").read_text())
+    for name, (_, said) in NAMED.items():
+        assert (said in text) == (name in there), name
 
 
 def test_the_model_of_lin_lee_is_not_set_beside_itself(exact, tmp_path):

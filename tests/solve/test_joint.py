@@ -1,202 +1,168 @@
-from __future__ import annotations
+"""Blocks and what they share, beside a dense solve of everything at once."""
 
+from dataclasses import dataclass, replace
+
+import numpy as np
 import pytest
 import torch
+from scipy.optimize import least_squares
+from torch import Tensor
 
-from reflectsep.solve.joint import (
-    JointOptions,
-    follow,
-    inverse,
-    local_in_chunks,
-    promised,
-    reduced_system,
-    shared_step,
-    solve_joint,
-)
-from reflectsep.solve.local import Termination
-from reflectsep.solve.problem import BlockProblem, robust_weight
+from reflectsep.solve.joint import reduced, solve_joint
+from reflectsep.solve.levenberg import Normal, Status, Termination
 
-BLOCKS, LOCAL, SHARED = 11, 3, 2
+TIMES = torch.linspace(0.0, 3.0, 8, dtype=torch.float64)[:, None]
+TRUTH = torch.tensor([0.8, 0.3, 0.0], dtype=torch.float64)
+END = Termination(tolerance=1e-12, max_iterations=60)
 
 
-def curve(local, shared, x, y):
-    """A decay of every block's own over a bend that all share."""
-    own = local[..., :1] * torch.exp(-local[..., 1:2] * x) + local[..., 2:3] * x
-    return own + shared[0] * torch.sin(shared[1] * x) - y
+@dataclass(frozen=True)
+class Decays:
+    """y = x_1 exp(-g_1 t) + x_2 + g_2 t in every block; the third shared parameter has no say but its prior's."""
 
+    y: Tensor
+    prior: float = 0.0
 
-def prior(shared):
-    return torch.stack([0.1 * (shared[0] - 0.5), 0.2 * shared.sum()])
+    def __len__(self):
+        return self.y.shape[1]
 
+    def take(self, index):
+        return replace(self, y=self.y[:, index])
 
-def curves(*, threshold=None, shared_residual=None, noise=0.0):
-    g = torch.Generator().manual_seed(5)
-    rand = lambda *n: torch.rand(*n, generator=g, dtype=torch.float64)  # noqa: E731
-    truth, shared = rand(BLOCKS, LOCAL) + 0.5, torch.tensor([0.4, 2.5], dtype=torch.float64)
-    x = torch.linspace(0, 4, 12, dtype=torch.float64).expand(BLOCKS, 12).contiguous()
-    y = curve(truth, shared, x, torch.zeros_like(x)) + noise * (rand(BLOCKS, 12) - 0.5)
-    problem = BlockProblem(residual=curve, data=(x, y), threshold=threshold, shared_residual=shared_residual)
-    return problem, truth, shared
+    def residuals(self, local, shared):
+        return local[0] * (-shared[0] * TIMES).exp() + local[1] + shared[1] * TIMES - self.y
 
+    def slopes(self, local, shared):
+        fall = (-shared[0] * TIMES).exp()
+        J = torch.stack([fall.expand_as(self.y), torch.ones_like(self.y)], 1)
+        rising = TIMES.expand_as(self.y)
+        return J, torch.stack([-TIMES * local[0] * fall, rising, torch.zeros_like(rising)], 1)
 
-def dense_system(problem, local, shared):
-    """J^T w J and J^T w r of everything at once, block after block, the shared parameters last; slow and obvious."""
-    n, P, G = *local.shape, len(shared)
-    H = torch.zeros(n * P + G, n * P + G, dtype=torch.float64)
-    gradient = torch.zeros(n * P + G, dtype=torch.float64)
-    for p in range(n):
-        data = [d[p] for d in problem.data]
-        r = problem.residual(local[p], shared, *data)
-        by_local, by_shared = torch.autograd.functional.jacobian(
-            lambda x, g, data=data: problem.residual(x, g, *data), (local[p], shared)
+    def normal(self, local, shared):
+        rows, (J, _) = self.residuals(local, shared), self.slopes(local, shared)
+        return Normal(
+            0.5 * rows.square().sum(0), torch.einsum("rpn,rn->pn", J, rows), torch.einsum("rpn,rqn->pqn", J, J)
         )
-        row = torch.zeros(len(r), n * P + G, dtype=torch.float64)
-        row[:, p * P : (p + 1) * P], row[:, n * P :] = by_local, by_shared
-        w = torch.diag(robust_weight(r[None], problem.threshold)[0])
-        H, gradient = H + row.T @ w @ row, gradient + row.T @ w @ r
-    if problem.shared_residual is not None:
-        Q = torch.autograd.functional.jacobian(problem.shared_residual, shared)
-        H[n * P :, n * P :] += Q.T @ Q
-        gradient[n * P :] += Q.T @ problem.shared_residual(shared)
-    return H, gradient
+
+    def coupled(self, local, shared):
+        rows, (J, Jg) = self.residuals(local, shared), self.slopes(local, shared)
+        at = self.normal(local, shared)
+        W, H = torch.einsum("rpn,rgn->pgn", J, Jg), torch.einsum("rgn,rhn->ghn", Jg, Jg)
+        return at.V, at.g, W, H, torch.einsum("rgn,rn->gn", Jg, rows)
+
+    def shared_rows(self, shared):
+        return torch.stack([self.prior * (shared[0] - 1.0), shared[2] - 0.7])
+
+    def bounded(self, shared):
+        return shared.clamp(-2.0, 2.0)
 
 
-@pytest.mark.parametrize("threshold", [None, 0.02])
-@pytest.mark.parametrize("shared_residual", [None, prior])
-def test_the_schur_step_is_the_dense_gauss_newton_step(threshold, shared_residual):
-    limits = None if threshold is None else torch.full((12,), threshold, dtype=torch.float64)
-    problem, truth, shared = curves(threshold=limits, shared_residual=shared_residual)
-    local, shared = truth + 0.02, shared + 0.01
-    H, gradient = dense_system(problem, local, shared)
-    dense = -torch.linalg.solve(H, gradient)
-
-    step = shared_step(reduced_system(problem, local, shared, 4), 0.0, None)
-    torch.testing.assert_close(step, dense[-SHARED:], rtol=1e-5, atol=1e-9)
-
-    moved = follow(problem, local, shared, step, 4)
-    expected = local + dense[:-SHARED].view(BLOCKS, LOCAL)
-    better = problem.costs(expected, shared + step) < problem.costs(local, shared + step)
-    assert better.sum() > BLOCKS // 2
-    torch.testing.assert_close(moved[better], expected[better], rtol=1e-5, atol=1e-7)
-    assert torch.equal(moved[~better], local[~better])
+def decays(blocks=25, noise=0.0, **options):
+    g = torch.Generator().manual_seed(2)
+    x = 0.5 + torch.rand(2, blocks, generator=g, dtype=torch.float64)
+    y = Decays(torch.zeros(8, blocks, dtype=torch.float64)).residuals(x, TRUTH)
+    return Decays(y + noise * torch.randn(y.shape, generator=g, dtype=torch.float64), **options), x
 
 
-def test_a_block_follows_only_where_that_lowers_its_cost():
-    problem, truth, shared = curves()
-    local = truth.clone()
-    local[:4] += 0.3
-    step = torch.tensor([0.5, -1.0], dtype=torch.float64)
-    moved = follow(problem, local, shared, step, 100)
-    assert (problem.costs(moved, shared + step) <= problem.costs(local, shared + step)).all()
+def solved(problem, free=(True, True, True), chunk=10, **options):
+    start = torch.ones(2, len(problem), dtype=torch.float64)
+    shared = torch.tensor([0.4, 0.0, 0.0], dtype=torch.float64)
+    options = {"end": END, "inner": END, "chunk": chunk} | options
+    return solve_joint(problem, start, shared, torch.tensor(free), **options)
 
 
-def test_information_is_the_inverse_of_the_marginal_covariance():
-    problem, truth, shared = curves(shared_residual=prior)
-    H, _ = dense_system(problem, truth, shared)
-    marginal = torch.linalg.inv(H)[-SHARED:, -SHARED:]
-    system = reduced_system(problem, truth, shared, 5)
-    torch.testing.assert_close(system.S, torch.linalg.inv(marginal), rtol=1e-5, atol=1e-8)
+def test_shared_parameters_come_back():
+    problem, x = decays()
+    found = solved(problem)
+    torch.testing.assert_close(found.shared[:2], TRUTH[:2], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(found.local, x, rtol=1e-4, atol=1e-4)
+    assert float(found.shared[2]) == pytest.approx(0.7)
+    assert found.status == Status.CONVERGED
+    assert all(later < earlier for earlier, later in zip(found.history, found.history[1:], strict=False))
 
 
-def test_chunks_add_up():
-    problem, truth, shared = curves()
-    whole = reduced_system(problem, truth + 0.05, shared, 100)
-    for chunk in (1, 3, 11):
-        part = reduced_system(problem, truth + 0.05, shared, chunk)
-        torch.testing.assert_close(part.S, whole.S, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(part.gradient, whole.gradient, rtol=1e-12, atol=1e-12)
+@pytest.mark.parametrize("prior", [0.0, 5.0])
+def test_it_is_the_minimum_of_a_dense_solve(prior):
+    problem, _ = decays(noise=0.05, prior=prior)
+
+    def rows(flat):
+        local, shared = torch.from_numpy(flat[:-3]).view(2, -1), torch.from_numpy(flat[-3:])
+        return torch.cat([problem.residuals(local, shared).flatten(), problem.shared_rows(shared)]).numpy()
+
+    start = np.concatenate([np.ones(50), [0.4, 0.0, 0.0]])
+    dense = least_squares(rows, start, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    found = solved(problem)
+    torch.testing.assert_close(found.shared, torch.from_numpy(dense.x[-3:]), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(found.local.flatten(), torch.from_numpy(dense.x[:-3]), rtol=1e-3, atol=1e-3)
+    total = float(found.cost.sum() + 0.5 * problem.shared_rows(found.shared).square().sum())
+    assert total == pytest.approx(dense.cost, rel=1e-8)
 
 
-@pytest.mark.parametrize("chunk", [1, 3, 11])
-def test_a_block_is_bit_for_bit_the_same_in_any_chunk(chunk):
-    problem, truth, shared = curves(noise=0.05)
-    whole = local_in_chunks(problem, truth + 0.1, shared, Termination(), 100)
-    part = local_in_chunks(problem, truth + 0.1, shared, Termination(), chunk)
-    assert torch.equal(part.local, whole.local)
-    assert torch.equal(part.cost, whole.cost)
-    step = torch.tensor([0.01, 0.02], dtype=torch.float64)
-    assert torch.equal(
-        follow(problem, truth + 0.1, shared, step, chunk), follow(problem, truth + 0.1, shared, step, 100)
-    )
+def test_the_reduced_system_is_the_schur_complement_of_the_dense_one():
+    problem, x = decays(noise=0.05, blocks=6, prior=2.0)
+    shared = torch.tensor([0.5, 0.1, 0.2], dtype=torch.float64)
+    S, right = reduced(problem, x, shared, 4, torch.arange(6))
+
+    def rows(flat):
+        local, g = flat[:-3].view(2, 6), flat[-3:]
+        return torch.cat([problem.residuals(local, g).flatten(), problem.shared_rows(g)])
+
+    flat = torch.cat([x.flatten(), shared])
+    J, r = torch.func.jacfwd(rows)(flat), rows(flat)
+    H, g = J.mT @ J, J.mT @ r
+    V, W = H[:-3, :-3], H[:-3, -3:]
+    torch.testing.assert_close(S, H[-3:, -3:] - W.mT @ torch.linalg.solve(V, W), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(right, -(g[-3:] - W.mT @ torch.linalg.solve(V, g[:-3])), rtol=1e-9, atol=1e-9)
 
 
-def test_blocks_and_shared_parameters_are_recovered():
-    problem, truth, shared = curves()
-    watched = []
-    found = solve_joint(
-        problem,
-        truth + 0.1,
-        shared + torch.tensor([0.1, -0.2], dtype=torch.float64),
-        JointOptions(tolerance=1e-12, chunk=4),
-        watch=lambda i, cost: watched.append((i, cost)),
-    )
-    assert found.converged
-    torch.testing.assert_close(found.shared, shared, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(found.local, truth, rtol=1e-3, atol=1e-4)
-    assert list(found.history) == sorted(found.history, reverse=True)
-    assert [cost for _, cost in watched] == list(found.history[1:])
-    assert [i for i, _ in watched] == list(range(1, len(watched) + 1))
+def test_what_is_not_free_stays():
+    problem, _ = decays(noise=0.05)
+    found = solved(problem, free=(True, False, False))
+    assert found.shared[1:].tolist() == [0.0, 0.0]
+    assert float(found.shared[0]) != 0.4
+    held = solved(problem, free=(False, False, False))
+    assert held.shared.tolist() == [0.4, 0.0, 0.0]
+    assert held.status == Status.CONVERGED
+    assert float(held.cost.sum()) > float(found.cost.sum())
 
 
-def test_the_optimum_has_no_gradient():
-    problem, truth, shared = curves(noise=0.1, shared_residual=prior)
-    found = solve_joint(problem, truth, shared, JointOptions(tolerance=1e-14, inner=Termination(max_iterations=30)))
-    H, gradient = dense_system(problem, found.local, found.shared)
-    # In standard deviations of the parameters.
-    assert float((gradient * torch.linalg.inv(H).diagonal().sqrt()).abs().max()) < 1e-4
+def test_blocks_that_the_model_does_not_explain_have_no_say():
+    problem, _ = decays(blocks=40)
+    problem.y[:, 3] += 2.0 * torch.cos(9.0 * TIMES[:, 0])
+    problem.y[:, 17] += 3.0 * TIMES[:, 0].square()
+    trimmed, whole = solved(problem, trim=0.9), solved(problem)
+    off = lambda found: float((found.shared[:2] - TRUTH[:2]).abs().max())  # noqa: E731
+    assert off(trimmed) < 1e-3
+    assert off(whole) > 10 * off(trimmed)
 
 
-def test_blocks_say_whether_they_came_to_their_end():
-    problem, truth, shared = curves(noise=0.1)
-    step = shared + torch.tensor([0.05, -0.05], dtype=torch.float64)
-    whole = solve_joint(problem, truth + 0.1, step)
-    assert bool(whole.settled.all())
-    hurried = solve_joint(
-        problem, truth + 0.1, step, JointOptions(inner=Termination(max_iterations=1), max_iterations=1)
-    )
-    assert not bool(hurried.settled.any())
+def test_it_does_not_depend_on_how_the_blocks_are_cut():
+    problem, _ = decays(noise=0.05)
+    once, thrice = solved(problem, chunk=100), solved(problem, chunk=9)
+    torch.testing.assert_close(once.shared, thrice.shared, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(once.local, thrice.local, rtol=1e-9, atol=1e-9)
 
 
-def test_it_stops_where_no_step_promises_more_than_the_tolerance():
-    problem, truth, shared = curves(noise=0.1)
-    rough = solve_joint(problem, truth, shared + 0.1, JointOptions(tolerance=1e-2))
-    fine = solve_joint(problem, truth, shared + 0.1, JointOptions(tolerance=1e-12))
-    assert rough.converged
-    assert fine.converged
-    assert rough.iterations < fine.iterations
-    assert promised(reduced_system(problem, rough.local, rough.shared, 100), None) <= 1e-2 * rough.cost
-    assert promised(reduced_system(problem, fine.local, fine.shared, 100), None) <= 1e-12 * fine.cost
-    # What is promised at the rough end is what the fine one gains, to second order.
-    gain = rough.cost - fine.cost
-    assert promised(reduced_system(problem, rough.local, rough.shared, 100), None) == pytest.approx(gain, rel=0.2)
+def test_iterations_are_limited_and_reported():
+    problem, _ = decays(noise=0.05)
+    seen = []
+    found = solved(problem, end=Termination(tolerance=0.0, max_iterations=2), watch=seen.append)
+    assert found.status == Status.EXHAUSTED
+    assert found.iterations == 2
+    assert seen == [1, 2]
+    assert len(found.history) == 2
 
 
-@pytest.mark.parametrize("held", [0, 1])
-def test_what_is_not_free_stays_bit_for_bit(held):
-    problem, truth, shared = curves()
-    start = shared + torch.tensor([0.1, -0.1], dtype=torch.float64)
-    free = torch.ones(2, dtype=torch.bool)
-    free[held] = False
-    found = solve_joint(problem, truth + 0.1, start, free=free)
-    assert found.shared[held] == start[held]
-    assert found.shared[1 - held] != start[1 - held]
+def test_blocks_without_a_finite_cost_have_no_say():
+    problem, _ = decays(blocks=40)
+    problem.y[2, 7] = torch.nan
+    found = solved(problem, trim=0.9)
+    torch.testing.assert_close(found.shared[:2], TRUTH[:2], rtol=1e-5, atol=1e-5)
+    problem.y[0] = torch.nan
+    assert solved(problem).status == Status.FAILED
 
 
-def test_the_iteration_limit_is_no_convergence():
-    problem, truth, shared = curves()
-    found = solve_joint(
-        problem, truth + 0.3, shared + 0.2, JointOptions(max_iterations=1, inner=Termination(max_iterations=1))
-    )
-    assert not found.converged
-    assert found.iterations == 1
-
-
-def test_inverse_is_the_inverse_and_ignores_what_nothing_feels():
-    g = torch.Generator().manual_seed(8)
-    J = torch.randn(4, 9, 3, generator=g, dtype=torch.float64) * torch.tensor([1.0, 1e-3, 1e3], dtype=torch.float64)
-    V = J.mT @ J
-    unit = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
-    scale = V.diagonal(dim1=-2, dim2=-1).rsqrt()
-    torch.testing.assert_close((inverse(V) @ V) * scale[:, None, :] / scale[:, :, None], unit, rtol=1e-6, atol=1e-6)
-    nothing = inverse(torch.zeros(1, 2, 2, dtype=torch.float64))
-    assert nothing.isfinite().all()
+def test_a_solve_of_no_blocks_is_refused():
+    problem, _ = decays()
+    with pytest.raises(ValueError, match="no blocks"):
+        solved(problem.take(slice(0, 0)))
