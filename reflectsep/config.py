@@ -137,8 +137,8 @@ class FitSettings:
     )
     n_s: float | None = setting(None, "exponent of the lobe; null: fitted", above=0.0, at_most=5000.0)
     f: float | None = setting(
-        None,
-        "share of scattered light that has forgotten the normal; null: fitted, 1: the paper, 0: Lin & Lee",
+        0.0,
+        "share of scattered light that has forgotten the normal; 0: Lin & Lee, 1: the paper, null: fitted",
         at_least=0.0,
         at_most=1.0,
     )
@@ -163,7 +163,6 @@ class FitSettings:
     )
     chunk: int = setting(4096, "pixels handled at once; bounds the memory", at_least=1)
     dtype: Literal["float32", "float64"] = setting("float64", "arithmetic of the fit")
-    device: Literal["cpu", "cuda"] = setting("cpu", "where chunks of pixels are solved; for cuda a larger fit.chunk")
     share: float = setting(
         1.0, "of the object that is fitted, in squares strewn evenly: for globals to hold", above=0.0, at_most=1.0
     )

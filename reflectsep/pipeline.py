@@ -12,8 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from reflectsep.calibrate.align_options import AlignOptions
 from reflectsep.calibrate.alignment import Alignment, align
 from reflectsep.calibrate.exposure import developed_stream, response_of
@@ -256,14 +254,7 @@ def measure(
 
 
 def fit_options(settings: FitSettings) -> FitOptions:
-    """Settings of the command as the stage takes them.
-
-    Raises:
-        SettingsError: a device that this machine, or this build of torch, does not have.
-    """
-    if settings.device == "cuda" and not torch.cuda.is_available():
-        built = f"torch {torch.__version__} is built {'for' if torch.version.cuda else 'without'} CUDA"
-        raise SettingsError(f"{settings.key}device=cuda: no CUDA device is to be had ({built}); expected cpu")
+    """Settings of the command as the stage takes them."""
     chosen = dataclasses.asdict(settings)
     del chosen["globals_from"], chosen["share"]
     return FitOptions(**chosen)

@@ -54,6 +54,8 @@ def make_result(*, size=64, channels=3, n_d=1.2, softness=0.1, fresnel=0.5, f=0.
         softness=torch.tensor(softness),
         fresnel=torch.tensor(fresnel if known else 0.0),
         ggx=ggx and known,
+        materials=torch.tensor([[1.0, truth.n_s]]),
+        material=torch.zeros(size, size, dtype=torch.int32),
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=truth.d.float() * root * mask,

@@ -71,6 +71,8 @@ def make_separation(*, channels=1, n_d=1.0, softness=0.0, fresnel=0.0, f=1.0, gg
         f=torch.tensor(f),
         fresnel=torch.tensor(fresnel),
         ggx=ggx,
+        materials=torch.tensor([[1.0, 6.0]]),
+        material=torch.zeros(HEIGHT, WIDTH, dtype=torch.int32),
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=(0.6 * rand(3, channels, HEIGHT, WIDTH) - 0.1) * mask,
@@ -228,7 +230,14 @@ def test_no_highlight_is_more_than_twice_as_high_as_those_of_most_pixels(tmp_pat
     long = torch.full((HEIGHT, WIDTH), 0.9)
     long[4, 2] = 1.2
     d = torch.einsum("k,hw->khw", basis[:, 2], long + 0.9)[:, None] * stack.mask
-    flat = replace(fit, a=-0.9 * basis[:, 2], n_s=torch.tensor(100.0), B=1.0 * stack.mask, d=d)
+    flat = replace(
+        fit,
+        a=-0.9 * basis[:, 2],
+        n_s=torch.tensor(100.0),
+        materials=torch.tensor([[1.0, 100.0]]),
+        B=1.0 * stack.mask,
+        d=d,
+    )
     separation = separate(stack, None, replace(flat, s=torch.zeros_like(fit.s)), {})
     assert float(separation.ceiling) == pytest.approx(0.9 * 2 ** (1 / 100), rel=1e-4)
     frontal = torch.linalg.solve(some_vectors()[:3].mT, torch.tensor([0.0, 0.0, 1.0]))
@@ -236,7 +245,7 @@ def test_no_highlight_is_more_than_twice_as_high_as_those_of_most_pixels(tmp_pat
     shine = (separation.relight(frontal) - separation.relight(frontal)[0, 4, 3] + 1.8 - body)[0, 4, 2]
     height = 0.9**100 * (1 - (1.0 + 50.0) ** -2 if ggx else 1.0)
     assert float(shine) == pytest.approx(height, rel=0.02)  # twice the height, less the one of the pixel beside it
-    free = replace(separation, ceiling=torch.tensor(torch.inf))
+    free = replace(separation, ceilings=torch.tensor([torch.inf]))
     assert float(free.relight(frontal)[0, 4, 2]) > 1e7
     separation.save(tmp_path / "result")
     assert torch.equal(load(tmp_path / "result").relight(frontal), separation.relight(frontal))

@@ -21,6 +21,8 @@ def tile_index(like: Tensor, tiles: int) -> Tensor:
     height, width = like.shape
     rows = (like > 0).any(1).nonzero()[:, 0]
     columns = (like > 0).any(0).nonzero()[:, 0]
+    if len(rows) == 0:
+        return torch.zeros(height, width, dtype=torch.long)  # no pixel counts, in whatever tile
     top, bottom = int(rows[0]), int(rows[-1]) + 1
     left, right = int(columns[0]), int(columns[-1]) + 1
     y = ((torch.arange(height) - top).clamp(0, bottom - top - 1) * tiles) // (bottom - top)

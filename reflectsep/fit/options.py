@@ -8,7 +8,7 @@ from reflectsep.data import Learnt
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """Choices of a fit; the defaults are the method at its best, the others the paper's own and the baseline's."""
+    """Choices of a fit: the model with all of its globals fitted, unless something is held."""
 
     method: Literal["joint", "two_step"] = "joint"
     """All parameters together, or globals on chosen pixels first and then every pixel on its own (paper, section 5)."""
@@ -21,7 +21,9 @@ class FitOptions:
     n_s: float | None = None
     """Fixed exponent of the lobe; None: fitted."""
     f: float | None = None
-    """Fixed share of the scattered light that has forgotten the normal (1 in the paper); None: fitted."""
+    """Share of the scattered light that has forgotten the normal: 0 as in Lin & Lee, 1 as in the paper; None: fitted.
+    Fitted, it is drawn to what is wrong with s, and highlights that no picture saw are then misplaced: the command
+    holds 0."""
     materials: int | None = None
     """Number of materials, each with a height and an exponent of its own; None: as many as the pictures want."""
     refine_n_d: bool = False
@@ -43,8 +45,6 @@ class FitOptions:
     chunk: int = 1 << 12
     """Pixels at once: enough for the calls to be cheap beside the arithmetic."""
     dtype: Literal["float32", "float64"] = "float64"
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where chunks are solved; what is kept of all pixels, and all other work, is the processor's."""
     given: Learnt | None = None
     """What another fit has learnt of the same object."""
     globals: Literal["held", "start"] = "held"

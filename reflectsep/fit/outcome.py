@@ -13,6 +13,7 @@ from reflectsep.fit.options import FitOptions
 from reflectsep.fit.problem import (
     ALPHA,
     LEAST_N_S,
+    LOG_N_S,
     MOST_N_S,
     SHARED_NAMES,
     PixelProblem,
@@ -262,7 +263,7 @@ def warnings(state: State, options: FitOptions, pictures: Pictures) -> tuple[str
             "a highlight; the specular component is not to be trusted"
         )
     for n_s in materials_of(state.shared, state.problem.obs.kinds)[1].exp().tolist():
-        if bool(state.free.any()) and not LEAST_N_S * 1.01 < n_s < MOST_N_S / 1.01:
+        if bool(state.free[LOG_N_S]) and not LEAST_N_S * 1.01 < n_s < MOST_N_S / 1.01:
             said.append(f"n_s ended at {n_s:.3g}: the pictures show no lobe that all pixels share")
     if state.joint is not None and state.joint.status == Status.FAILED:
         said.append("the joint fit found no globals that lower the cost")

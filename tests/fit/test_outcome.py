@@ -28,8 +28,8 @@ def test_deviations_are_those_of_the_whole_covariance(random_problem):
 
 def test_names_of_globals_are_of_lights_where_alphas_are_refined(model_case):
     stack = model_case(size=8).stack
-    assert names_of(stack, torch.zeros(ALPHA)) == SHARED_NAMES
-    names = names_of(stack, torch.zeros(ALPHA + 12))
+    assert names_of(stack, torch.zeros(ALPHA), 1) == SHARED_NAMES
+    names = names_of(stack, torch.zeros(ALPHA + 12), 1)
     assert names[ALPHA] == f"alpha_{stack.names[3]}_{stack.names[0]}"
     assert len(set(names)) == ALPHA + 12
 

@@ -111,7 +111,7 @@ def test_recorded_garbage_is_a_result_error(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"format": "reflectsep-result/2", "checksums": {}}', "format is 'reflectsep-result/2', expected"),
+        ('{"format": "reflectsep-result/1", "checksums": {}}', "format is 'reflectsep-result/1', expected"),
         ('{"format": "reflectsep-result/2"}', "no checksums"),
         ("[]", "format is None"),
         ("{", "not JSON"),

@@ -36,6 +36,8 @@ def exact():
         f=torch.tensor(1.0),
         fresnel=torch.tensor(0.0),
         ggx=False,
+        materials=torch.tensor([[1.0, truth.n_s]]),
+        material=torch.zeros_like(flags),
         global_names=("a_1",),
         covariance=torch.eye(1),
         d=truth.d.float(),

@@ -8,7 +8,7 @@ import torch
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from reflectsep.solve.joint import reduced, solve_joint
+from reflectsep.solve.joint import following, reduced, solve_joint
 from reflectsep.solve.levenberg import Normal, Status, Termination
 
 TIMES = torch.linspace(0.0, 3.0, 8, dtype=torch.float64)[:, None]
@@ -101,7 +101,7 @@ def test_it_is_the_minimum_of_a_dense_solve(prior):
 def test_the_reduced_system_is_the_schur_complement_of_the_dense_one():
     problem, x = decays(noise=0.05, blocks=6, prior=2.0)
     shared = torch.tensor([0.5, 0.1, 0.2], dtype=torch.float64)
-    S, right = reduced(problem, x, shared, 4, torch.arange(6))
+    S, right, X = reduced(problem, x, shared, 4, torch.arange(6))
 
     def rows(flat):
         local, g = flat[:-3].view(2, 6), flat[-3:]
@@ -113,6 +113,9 @@ def test_the_reduced_system_is_the_schur_complement_of_the_dense_one():
     V, W = H[:-3, :-3], H[:-3, -3:]
     torch.testing.assert_close(S, H[-3:, -3:] - W.mT @ torch.linalg.solve(V, W), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(right, -(g[-3:] - W.mT @ torch.linalg.solve(V, g[:-3])), rtol=1e-9, atol=1e-9)
+    dg = torch.tensor([0.01, -0.02, 0.03], dtype=torch.float64)
+    expected = -torch.linalg.solve(V, g[:-3] + W @ dg).view(2, 6)
+    torch.testing.assert_close(following(X, dg), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_what_is_not_free_stays():
@@ -138,7 +141,8 @@ def test_blocks_that_the_model_does_not_explain_have_no_say():
 
 def test_it_does_not_depend_on_how_the_blocks_are_cut():
     problem, _ = decays(noise=0.05)
-    once, thrice = solved(problem, chunk=100), solved(problem, chunk=9)
+    exact = Termination(tolerance=1e-15, max_iterations=60)
+    once, thrice = (solved(problem, chunk=chunk, end=exact, inner=exact) for chunk in (100, 9))
     torch.testing.assert_close(once.shared, thrice.shared, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(once.local, thrice.local, rtol=1e-9, atol=1e-9)
 

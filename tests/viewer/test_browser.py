@@ -157,21 +157,21 @@ def test_gloss_changes_the_lobe_as_the_formula_says(page, result, tmp_path):
     page.open(written(tmp_path / "page.html", separation), "zoom=1")
     direction = directions_inside(separation, 1, seed=8)[0]
     page.settle(x=direction[0].item(), y=direction[1].item(), ns=5.0)
-    other = dataclasses.replace(separation, n_s=torch.tensor(5.0))
+    other = dataclasses.replace(separation, n_s=torch.tensor(5.0), materials=torch.tensor([[1.0, 5.0]]))
     white = white_point(separation.highlight_free + separation.specular, separation.mask)
     expected = tone(other.relight(mix_of(other, direction, float(separation.intensity.mean()))), white=white)
     assert share_within_one(middle(page.pixels()), expected)[0] >= 0.999
 
 
 def test_a_lobe_stops_at_the_ceiling_as_in_relight(page, result, tmp_path):
-    separation = dataclasses.replace(result(size=SIZE), ceiling=torch.tensor(0.6))
+    separation = dataclasses.replace(result(size=SIZE), ceilings=torch.tensor([0.6]))
     page.open(written(tmp_path / "page.html", separation), "zoom=1")
     direction = directions_inside(separation, 1, seed=8)[0]
     page.settle(x=direction[0].item(), y=direction[1].item())
     white = white_point(separation.highlight_free + separation.specular, separation.mask)
     alpha = mix_of(separation, direction, float(separation.intensity.mean()))
     assert share_within_one(middle(page.pixels()), tone(separation.relight(alpha), white=white))[0] >= 0.999
-    free = dataclasses.replace(separation, ceiling=torch.tensor(torch.inf))
+    free = dataclasses.replace(separation, ceilings=torch.tensor([torch.inf]))
     assert share_within_one(middle(page.pixels()), tone(free.relight(alpha), white=white))[0] < 0.999
 
 

@@ -90,7 +90,7 @@ def test_the_pyramid_starts_below_the_limit_and_ends_small(result):
     small = full_level(result(size=28, channels=1))
     large = {
         name: getattr(small, name).repeat(*[1] * (getattr(small, name).ndim - 2), 25, 25)
-        for name in ("d", "s", "w", "B", "flags", "mask")
+        for name in ("d", "s", "w", "B", "flags", "mask", "material")
     }
     levels = pyramid(dataclasses.replace(small, **large), 400_000)
     assert [level.size for level in levels] == [(350, 350), (175, 175)]
