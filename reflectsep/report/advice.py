@@ -13,7 +13,7 @@ ADVICE = (
         "fit=lin_lee.",
     ),
     (
-        "lobe that is fitted",
+        "show no lobe that all",
         "Check the light directions (a chrome ball: reflectsep calibrate), and whether pictures are clipped.",
     ),
     ("stopped at its limit", "Fit again with a larger fit.max_iterations, and look whether the globals change."),

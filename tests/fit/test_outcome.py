@@ -52,7 +52,9 @@ def test_pictures_without_a_highlight_are_warned_of_with_advice(model_case):
     case = model_case(size=10, n_s=25.0)
     dull = replace(case.stack, images=case.stack.images - case.specular[:, None].float())
     fit = fit_reflectance(dull, case.scattering)
-    said = [text for text in fit.warnings if "show the highlight in two or more pictures" in text]
+    # Either hardly any pixel shows a highlight, or what is left of one is too broad to be told from the body.
+    kinds = ("show the highlight in two or more pictures", "the pictures show no lobe that all pixels share")
+    said = [text for text in fit.warnings if any(kind in text for kind in kinds)]
     assert len(said) == 1
     assert what_to_do(said[0]) != GENERAL
     assert math.isfinite(fit.cost)

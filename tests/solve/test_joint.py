@@ -144,7 +144,8 @@ def test_it_does_not_depend_on_how_the_blocks_are_cut():
     exact = Termination(tolerance=1e-15, max_iterations=60)
     once, thrice = (solved(problem, chunk=chunk, end=exact, inner=exact) for chunk in (100, 9))
     torch.testing.assert_close(once.shared, thrice.shared, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(once.local, thrice.local, rtol=1e-9, atol=1e-9)
+    # A cost in double precision tells a minimum to the root of its rounding, about 1e-8, and no better.
+    torch.testing.assert_close(once.local, thrice.local, rtol=1e-7, atol=1e-7)
 
 
 def test_iterations_are_limited_and_reported():
