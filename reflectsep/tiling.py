@@ -169,7 +169,7 @@ def join(names: Sequence[str], parts: Sequence[Separation], size: tuple[int, int
     maps: dict[str, Tensor] = {}
     for name in MAPS:
         own = [getattr(part, name) for part in parts]
-        if name not in ("mask", "flags"):
+        if name not in ("mask", "flags", "material"):
             maps[name] = mixed(own, regions, share, size)
     maps["mask"] = torch.zeros(size[1], size[0], dtype=torch.bool)
     outside = torch.zeros(size[1], size[0], dtype=parts[0].flags.dtype)
@@ -177,6 +177,8 @@ def join(names: Sequence[str], parts: Sequence[Separation], size: tuple[int, int
         place = (region.rows, region.columns)
         maps["mask"][place] |= part.mask
         outside[place] = torch.where(part.mask, outside[place], part.flags)
+    nothing = torch.zeros(size[1], size[0], dtype=parts[0].material.dtype)
+    maps["material"] = chosen([part.material for part in parts], regions, share, nothing)
     maps["flags"] = chosen([part.flags for part in parts], regions, share, outside)
     ceilings = torch.stack([part.ceilings for part in parts]).nan_to_num(posinf=0.0).amax(0)
     joined = replace(parts[0], **maps, ceilings=torch.where(ceilings > 0, ceilings, torch.inf))
