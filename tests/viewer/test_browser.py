@@ -73,7 +73,7 @@ def window(page):
     "options",
     [
         {},
-        {"channels": 1, "n_d": 1.0, "softness": 0.0, "crest": 0.0},
+        {"channels": 1, "n_d": 1.0, "softness": 0.0, "fresnel": 0.0, "f": 1.0, "ggx": False},
         {"unit": 3000.0},
         {"unit": 1e-5, "channels": 1},
         {"size": 600, "channels": 1},
@@ -153,7 +153,7 @@ def test_highlight_fader_at_zero_removes_the_highlight_and_components_fade(page,
 
 
 def test_gloss_changes_the_lobe_as_the_formula_says(page, result, tmp_path):
-    separation = result(size=SIZE, crest=0.0)
+    separation = result(size=SIZE, ggx=False)
     page.open(written(tmp_path / "page.html", separation), "zoom=1")
     direction = directions_inside(separation, 1, seed=8)[0]
     page.settle(x=direction[0].item(), y=direction[1].item(), ns=5.0)
@@ -339,7 +339,7 @@ def test_read_out_tells_the_parameters_of_the_pixel(page, colour, colour_page):
     assert said["pixel"] == f"x {column}, y {row}"
     found = [float(word) for word in said["d"].split(" | ")[1].split()]
     assert found == pytest.approx(colour.d[:, 1, row, column].tolist(), rel=2e-2)
-    assert float(said["B"]) == pytest.approx(float(colour.B.mean(0)[row, column]), rel=1e-2)
+    assert float(said["B"]) == pytest.approx(float(colour.B[row, column]), rel=1e-2)
     assert said["flags"].count(";") == 2
     direction = torch.tensor([0.1, 0.1, math.sqrt(1 - 0.02)])
     value = colour.relight(mix_of(colour, direction, float(colour.intensity.mean())))[:, row, column]

@@ -71,7 +71,7 @@ def weights_of(kind, x, y, z):
 
 @pytest.mark.parametrize(("kind", "channels"), [("ptm", 3), ("hsh", 3), ("hsh", 1)])
 def test_a_browser_sees_what_the_export_says(page, result, tmp_path, kind, channels):
-    result(size=64, channels=channels, n_d=1.0, crest=0.0).save(tmp_path / "result")
+    result(size=64, channels=channels, n_d=1.0, ggx=False).save(tmp_path / "result")
     out = tmp_path / "out"
     run_export(ExportJob(result=str(tmp_path / "result"), format=f"relight_{kind}", out=str(out), tilt_deg=40.0))
     separation = load(tmp_path / "result")

@@ -26,7 +26,7 @@ def large(result):
     """A small result, enlarged; only what a page is made of is there at full size."""
     if os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") < NEEDED_GB * 1e9:
         pytest.skip(f"needs {NEEDED_GB} GB of memory")
-    small = result(size=256, channels=1, n_d=1.0, crest=0.0)
+    small = result(size=256, channels=1, n_d=1.0, ggx=False)
     row, column = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
     mask = row.square() + column.square() < 0.92
 
@@ -42,6 +42,7 @@ def large(result):
         d=enlarged(small.d),
         s=enlarged(small.s),
         B=enlarged(small.B),
+        material=torch.zeros(HEIGHT, WIDTH, dtype=torch.int32),
     )
 
 
