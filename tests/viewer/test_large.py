@@ -26,7 +26,7 @@ def large(result):
     """A small result, enlarged; only what a page is made of is there at full size."""
     if os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") < NEEDED_GB * 1e9:
         pytest.skip(f"needs {NEEDED_GB} GB of memory")
-    small = result(size=256, channels=1, n_d=1.0, ggx=False)
+    small = result(size=256, channels=1, n_d=1.0, f=1.0, ggx=False)
     row, column = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
     mask = row.square() + column.square() < 0.92
 
