@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional as nnf
 
+from reflectsep.fit.neighbours import gaussian_sum
 from reflectsep.fit.problem import LOG_N_S, PixelProblem, log_size
 from reflectsep.solve.joint import JointSolution
 from reflectsep.solve.levenberg import Solution
@@ -59,17 +59,8 @@ class Materials:
 def averaged(cost: Float[Tensor, "pixels"], mask: Bool[Tensor, "height width"]) -> Float[Tensor, "pixels"]:
     """Mean of the costs around every pixel, over the object alone."""
     reach = int(3 * AREA_PX)
-    at = torch.arange(-reach, reach + 1, dtype=cost.dtype)
-    kernel = torch.exp(-0.5 * (at / AREA_PX).square())
-
-    def blurred(values: Tensor) -> Tensor:
-        picture = values.new_zeros(mask.shape)
-        picture[mask] = values
-        rows = nnf.conv2d(picture[None, None], kernel[None, None, :, None], padding=(reach, 0))
-        return nnf.conv2d(rows, kernel[None, None, None], padding=(0, reach))[0, 0][mask]
-
     bounded = cost.clamp_max(WORST).nan_to_num(nan=WORST)
-    return blurred(bounded) / blurred(torch.ones_like(cost))
+    return gaussian_sum(bounded, mask, AREA_PX, reach) / gaussian_sum(torch.ones_like(cost), mask, AREA_PX, reach)
 
 
 def assigned(

@@ -117,6 +117,18 @@ def plus_spread(S: Float[Tensor, "6 *rest"], spread: float) -> Float[Tensor, "6 
     return result
 
 
+def gaussian_sum(
+    values: Float[Tensor, "pixels"], mask: Bool[Tensor, "height width"], width_px: float, reach: int
+) -> Float[Tensor, "pixels"]:
+    """Sum of the values around every pixel, the pixel itself with weight 1; nothing counts outside the mask."""
+    at = torch.arange(-reach, reach + 1, dtype=values.dtype)
+    kernel = torch.exp(-0.5 * (at / width_px).square())
+    picture = values.new_zeros(mask.shape)
+    picture[mask] = values
+    rows = nnf.conv2d(picture[None, None], kernel[None, None, :, None], padding=(reach, 0))
+    return nnf.conv2d(rows, kernel[None, None, None], padding=(0, reach))[0, 0][mask]
+
+
 def pooled(
     said: Messages, mask: Bool[Tensor, "height width"], width_px: float, spread: float
 ) -> tuple[Float[Tensor, "3 pixels"], Float[Tensor, "6 pixels"]]:
@@ -124,15 +136,9 @@ def pooled(
     weight = inverse(plus_spread(said.covariance, spread))
     planes = torch.cat([weight, symmetric_times(weight, said.mean)])
     reach = max(1, math.ceil(2.5 * width_px))
-    at = torch.arange(-reach, reach + 1, dtype=planes.dtype)
-    kernel = torch.exp(-0.5 * (at / width_px).square())
     result = empty(9, planes.shape[1], dtype=planes.dtype)
     for values, out in zip(planes, result, strict=True):
-        picture = values.new_zeros(mask.shape)
-        picture[mask] = values
-        around = nnf.conv2d(picture[None, None], kernel[None, None, :, None], padding=(reach, 0))
-        around = nnf.conv2d(around, kernel[None, None, None], padding=(0, reach))[0, 0]
-        out[:] = (around - picture)[mask]
+        out[:] = gaussian_sum(values, mask, width_px, reach) - values
     result[[0, 3, 5]] += FAINT
     found = inverse(result[:6])
     return symmetric_times(found, result[6:]), plus_spread(found, spread)

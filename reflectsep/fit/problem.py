@@ -390,8 +390,9 @@ class PixelProblem:
         J = local.new_zeros(len(at.rows), 3 * channels + 1, pixels)
         pictures = J[:count, :-1].view(lights, channels, 3, channels, pixels)
         for k in range(3):
+            # A channel's d reaches a value of any channel through the lobe, which sees the mean of all.
             shine = at.G[k][:, None] * at.scale
-            pictures[:, :, k] = (share_of(at.share, shine))[:, :, None]
+            pictures[:, :, k] = (at.share * shine)[:, :, None]
             pictures[:, :, k].diagonal(dim1=1, dim2=2).add_(at.Phi[k].movedim(1, -1))
         J[:count, -1] = ((at.G * at.z[:, None]).sum(0)[:, None] * at.scale).flatten(0, 1)
         for i, slope in enumerate(at.extra, count):
@@ -515,8 +516,3 @@ class _Slopes:
     body: Float[Tensor, "lights channels pixels"]
     chain: Tensor
     """Derivative of the body by q T."""
-
-
-def share_of(share: Float[Tensor, "pixels"], shine: Float[Tensor, "lights channels pixels"]) -> Tensor:
-    """What a channel's d adds to a value through the lobe, which sees the mean of all channels."""
-    return share * shine
